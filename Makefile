@@ -1,0 +1,45 @@
+# Everything runs in .venv, which the first target that needs it creates.
+#   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
+#   make test | bench | lint | clean
+#   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
+PYTHON ?= python3
+SCENE ?= scenes/pegasus/scene.xml
+CONFIG ?= configs/quick.toml
+OUT ?= runs/demo
+TORCH ?= torch==2.13.0
+TORCH_INDEX ?=
+PYTEST_ARGS ?=
+
+PY := .venv/bin/python
+STAMP := .venv/.installed
+
+.PHONY: demo test bench lint clean install llvm
+.DEFAULT_GOAL := demo
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml tools/make_venv.sh
+	@PYTHON="$(PYTHON)" TORCH="$(TORCH)" TORCH_INDEX="$(TORCH_INDEX)" bash tools/make_venv.sh
+	@touch $@
+
+llvm:
+	@bash tools/ensure_llvm.sh
+
+demo: $(STAMP) llvm
+	@if [ -e "$(OUT)" ]; then mv "$(OUT)" "$(OUT).until-$$(date +%Y%m%d-%H%M%S)"; fi
+	$(PY) -m fd_mitsuba run $(SCENE) -c $(CONFIG) -o $(OUT)
+	@echo "pictures: $(OUT)/images and $(OUT)/videos    meshes: $(OUT)/export"
+
+test: $(STAMP) llvm
+	$(PY) -m pytest $(PYTEST_ARGS)
+
+bench: $(STAMP) llvm
+	$(PY) benchmarks/geometry_step.py --json
+
+lint: $(STAMP)
+	$(PY) -m ruff check .
+
+clean:
+	rm -rf build dist .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks scenes -name __pycache__ -type d -prune -exec rm -rf {} +
+	@echo "kept: .venv and runs (remove them by hand)"

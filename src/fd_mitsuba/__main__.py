@@ -1,0 +1,8 @@
+"""`python -m fd_mitsuba`."""
+
+import sys
+
+from fd_mitsuba.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

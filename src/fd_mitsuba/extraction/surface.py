@@ -1,0 +1,297 @@
+"""The surface of base and part together, extracted again each step at the cost of the part's neighbourhood.
+
+Only *active* vertices of the grid, those near the focal regions, know the part; elsewhere `sdf_part` is the constant
+`FAR_OUTSIDE`, so the union there is the base, exactly, and its triangles are extracted once. A step then
+
+1. evaluates `sdf_part` at all active vertices without gradients, for the signs and with them the topology;
+2. evaluates it again, with gradients, at the ends of crossed edges and at the caller's samples, which are the only
+   vertices that a loss can reach;
+3. joins the result with the base's triangles into one welded mesh.
+
+`SurfaceExtractor.extract_plain` does the same the long way round and is the oracle of the tests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from fd_mitsuba.extraction.lattice_box import LatticeBox, touched_cells
+from fd_mitsuba.extraction.marching_tets import (
+    crossing_faces,
+    crossing_faces_plain,
+    crossing_fraction,
+    edge_ends,
+    true_positions,
+)
+from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.fields.lattice_sites import LatticeSites
+from fd_mitsuba.fields.part_sdf import PartField, PartValues
+from fd_mitsuba.fields.union import soft_union
+
+FAR_OUTSIDE = -10.0
+"""`sdf_part` where it is not evaluated: below any base sdf by more than any fillet, so that the union is the base."""
+
+DEFAULT_MARGIN = 0.15
+"""How far beyond the focal regions the part may reach at most, canonical units: three of the focal loss' free bands."""
+
+_OFFSET_CELLS = 0.5
+
+
+@dataclass(frozen=True)
+class UnionSurface:
+    """A welded triangle mesh, counter-clockwise seen from outside; empty tensors where there is no surface.
+
+    Attributes:
+        vertices: (V, 3) float32, canonical; gradients flow to the part's field.
+        faces: (F, 3) int64.
+        part_weight: (V,) in [0, 1], 0 on the base and 1 on the part, `clamp(0.5 + (sdf_part - sdf_base) / (2 w))` at
+            the vertex; gradients flow. Unlike a label per face it moves continuously with the seam.
+        face_is_part: (F,) bool, whether the mean of a face's part_weight exceeds 0.5.
+        sample_sdf: (S,) `sdf_part` at the samples that the caller asked for; gradients flow.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    part_weight: Tensor
+    face_is_part: Tensor
+    sample_sdf: Tensor
+
+
+def active_vertices(grid: TetGrid, region_sdf: Tensor, margin: float = DEFAULT_MARGIN) -> Tensor:
+    """The vertices (A,) int64, ascending, that the part may reach: inside a region or closer to one than `margin`.
+
+    Args:
+        grid: the grid.
+        region_sdf: (count,) signed distance to the focal regions, inside positive, the largest over the regions.
+        margin: canonical units.
+
+    The grid's border is left out, so that every surface is closed within the grid.
+    """
+    index = (region_sdf > -margin).nonzero()[:, 0]
+    return index[~grid.is_border(index)]
+
+
+class SurfaceExtractor:
+    """Turns a part's field into the surface of its union with a constant base.
+
+    Args:
+        grid: the tetrahedral grid.
+        sdf_base: (count,) base sdf at its vertices, inside positive, canonical units.
+        initial_sdf: (count,) signed distance to the focal regions there, where the part's field starts.
+        active_index: (A,) vertices at which the part exists (see `active_vertices`); border vertices are dropped.
+        union_k: width of the fillet, canonical units; 0: none.
+        union_only_outside: see `soft_union`.
+        seam_width: w of `part_weight`, canonical units; None: one spacing.
+
+    Attributes:
+        active_index: (A,) int64 ascending.
+        movable: (A,) bool, the active vertices that offsets may move. Deviates from the paper's mask "s_e >= 0", which
+            would also let vertices of the base's surface move: a vertex is movable if none of the cells around it
+            contains a sign change of the base, so that every triangle of the base's own surface stays as it was.
+    """
+
+    def __init__(
+        self,
+        grid: TetGrid,
+        sdf_base: Tensor,
+        initial_sdf: Tensor,
+        active_index: Tensor,
+        union_k: float = 0.15,
+        union_only_outside: bool = False,
+        seam_width: float | None = None,
+    ) -> None:
+        self.grid = grid
+        self.sdf_base = sdf_base.detach()
+        self.initial_sdf = initial_sdf.detach()
+        self.active_index = active_index[~grid.is_border(active_index)].unique()
+        self.union_k = union_k
+        self.union_only_outside = union_only_outside
+        self.seam_width = grid.spacing if seam_width is None else seam_width
+        self._shape = (grid.side,) * 3
+        self.movable = _away_from_surface(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
+        self._movable = self._mark(self.active_index[self.movable])
+        self._box = LatticeBox(grid, self.active_index)
+        self._active = self._mark(self.active_index)
+        self._box_cells = touched_cells(self._box.cut(self._active))
+        self._box_inside = self._box.cut(self.sdf_base > 0).contiguous()
+        self._sites: LatticeSites | None = None
+        self._prepare_static()
+
+    def __call__(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+        """The union's surface for the field's present parameters.
+
+        Args:
+            field: the part; all calls must use the same hash grid layout.
+            samples: (S,) active vertices, in any order, repeats allowed, at which `sample_sdf` is wanted.
+        """
+        sites, features, sdf_part = self._part_at_sites(field)
+        union = soft_union(self._site_base, sdf_part, self.union_k, self.union_only_outside)
+        edges, faces = self._crossings(union > 0)
+        lower, upper = edge_ends(edges, self._box.shape)
+        fixed = (self._box_site[lower] < 0) & (self._box_site[upper] < 0)
+        places = torch.empty(len(edges), dtype=torch.int64)
+        places[fixed] = torch.searchsorted(self._static_edges, self._box.grid_edges(edges[fixed]))
+        lower, upper = lower[~fixed], upper[~fixed]
+        places[~fixed] = torch.arange(len(lower)) + len(self._static_edges)
+
+        ends, position = self._box.unique(torch.cat([lower, upper]))
+        values, end_sites, sample_sdf = self._values_with_gradient(field, sites, features, ends, samples)
+        vertices, part_weight = self._surface_vertices(ends, values, end_sites, position.view(2, -1))
+        part_weight = torch.cat([part_weight.new_zeros(len(self._static_vertices)), part_weight])
+        faces = places[faces]
+        is_part = torch.cat([self._static_is_part, _faces_of_part(part_weight, faces)])
+        vertices = torch.cat([self._static_vertices, vertices])
+        return UnionSurface(vertices, torch.cat([self._static_faces, faces]), part_weight, is_part, sample_sdf)
+
+    def extract_plain(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+        """The same surface, vertices in another order, from the field at all vertices and all tetrahedra."""
+        everything = torch.arange(self.grid.count)
+        everywhere = field.evaluate(self.grid.positions(everything, self.sdf_base.dtype), self.initial_sdf)
+        sdf_part = torch.where(self._active, everywhere.sdf, FAR_OUTSIDE)
+        union = soft_union(self.sdf_base, sdf_part, self.union_k, self.union_only_outside)
+        moved = self._moved(everything, everywhere.offset)
+        ends, faces = crossing_faces_plain(union.detach() > 0, self.grid.tets())
+        vertices, part_weight = self._on_edges(moved, union, sdf_part - self.sdf_base, ends.t())
+        sample_sdf = sdf_part[:0] if samples is None else sdf_part[samples]
+        return UnionSurface(vertices, faces, part_weight, _faces_of_part(part_weight, faces), sample_sdf)
+
+    @torch.no_grad()
+    def extract_part(self, field: PartField, other_sdf: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The part alone, a closed solid: vertices (V, 3), faces (F, 3) of the zero set of `sdf_part`; no gradients.
+
+        Args:
+            field: the part.
+            other_sdf: (count,) limits it to `min(sdf_part, other_sdf)`, which cuts out one of several named parts.
+        """
+        sites, features, _ = self._part_at_sites(field)
+        values = field.site_values(sites, features, torch.arange(len(sites)), self.initial_sdf[sites.index])
+        sdf = self.sdf_base.new_full((self.grid.count,), FAR_OUTSIDE)
+        sdf[sites.index] = values.sdf if other_sdf is None else torch.minimum(values.sdf, other_sdf[sites.index])
+        offset = sdf.new_zeros(self.grid.count, 3)
+        offset[sites.index] = values.offset
+        edges, faces = crossing_faces(sdf.view(self._shape) > 0)
+        ends = torch.stack(edge_ends(edges, self._shape))
+        moved = self._moved(torch.arange(self.grid.count), offset)
+        return self._on_edges(moved, sdf, sdf, ends)[0], faces
+
+    @property
+    def static_faces(self) -> int:
+        """How many faces at the head of every surface's list are the base's own and never change."""
+        return len(self._static_faces)
+
+    @torch.no_grad()
+    def part_sdf(self, field: PartField) -> Tensor:
+        """`sdf_part` (A,) at `active_index`, without gradients."""
+        sites, _, sdf_part = self._part_at_sites(field)
+        return sdf_part[self._box_site[self._box.local(self.active_index)].long()]
+
+    def _prepare_static(self) -> None:
+        """What the base contributes whatever the part does: edges without, and cells without, an active end."""
+        inside = self.sdf_base.view(self._shape) > 0
+        edges, _ = crossing_faces(inside)
+        ends = torch.stack(edge_ends(edges, self._shape))
+        still = ~self._active[ends].any(dim=0)
+        self._static_edges = edges[still]
+        used, position = ends[:, still].unique(return_inverse=True)
+        base = self.sdf_base[used]
+        positions = self.grid.positions(used, base.dtype)
+        self._static_vertices, _ = self._on_edges(positions, base, base, position)
+        cell_edges, faces = crossing_faces(inside, ~touched_cells(self._active.view(self._shape)))
+        self._static_faces = torch.searchsorted(self._static_edges, cell_edges)[faces]
+        self._static_is_part = torch.zeros(len(faces), dtype=torch.bool)
+
+    def _part_at_sites(self, field: PartField) -> tuple[LatticeSites, Tensor, Tensor]:
+        if self._sites is None:
+            self._sites = field.sites(self.grid.axis, self.active_index)
+            self._site_base = self.sdf_base[self._sites.index]
+            self._site_initial = self.initial_sdf[self._sites.index]
+            self._site_box = self._box.local(self._sites.index)
+            self._box_site = torch.full((len(self._box.vertices),), -1, dtype=torch.int32)
+            self._box_site[self._site_box] = torch.arange(len(self._sites), dtype=torch.int32)
+        features = field.site_features(self._sites)
+        return self._sites, features, field.site_sdf(features, self._site_initial)
+
+    def _crossings(self, inside_at_sites: Tensor) -> tuple[Tensor, Tensor]:
+        """The crossed edges, in the box's numbers, and the faces of its cells that touch a site."""
+        if len(inside_at_sites) == 0:
+            return self._static_edges[:0], self._static_faces[:0]
+        inside = self._box_inside.clone()
+        inside.view(-1).index_copy_(0, self._site_box, inside_at_sites)
+        return crossing_faces(inside, self._box_cells)
+
+    def _values_with_gradient(
+        self, field: PartField, sites: LatticeSites, features: Tensor, ends: Tensor, samples: Tensor | None
+    ) -> tuple[PartValues, Tensor, Tensor]:
+        """The field at the sites among `ends` and `samples` (one evaluation), and where each of them is in it.
+
+        Returns the values, the position in them of each end (-1: not active), and `sample_sdf`.
+        """
+        end_sites = self._box_site[ends].long()
+        sample_sites = end_sites[:0] if samples is None else self._box_site[self._local_samples(samples)].long()
+        wanted = torch.zeros(len(sites), dtype=torch.bool)
+        wanted[end_sites[end_sites >= 0]] = True
+        wanted[sample_sites] = True
+        chosen = true_positions(wanted)
+        position = torch.full((len(sites) + 1,), -1, dtype=torch.int64)  # the last entry serves ends that are no site
+        position[chosen] = torch.arange(len(chosen))
+        values = field.site_values(sites, features, chosen, self._site_initial[chosen])
+        return values, position[end_sites], values.sdf.index_select(0, position[sample_sites])
+
+    def _local_samples(self, samples: Tensor) -> Tensor:
+        if not self._active[samples].all():
+            raise ValueError("samples must be taken from active_index")
+        return self._box.local(samples)
+
+    def _surface_vertices(
+        self, ends: Tensor, values: PartValues, end_values: Tensor, edges: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Vertices and part_weight on `edges` (2, E), pairs of places in `ends` (M,), which are numbers in the box.
+
+        `end_values` (M,) is the place of each end in `values`, or -1.
+        """
+        known = true_positions(end_values >= 0)
+        source = end_values[known]
+        index = self._box.vertices[ends]
+        base = self.sdf_base[index]
+        sdf_part = torch.full_like(base, FAR_OUTSIDE).index_copy(0, known, values.sdf.index_select(0, source))
+        offset = base.new_zeros(len(ends), 3).index_copy(0, known, values.offset.index_select(0, source))
+        union = soft_union(base, sdf_part, self.union_k, self.union_only_outside)
+        return self._on_edges(self._moved(index, offset), union, sdf_part - base, edges)
+
+    def _mark(self, index: Tensor) -> Tensor:
+        marks = torch.zeros(self.grid.count, dtype=torch.bool)
+        marks[index] = True
+        return marks
+
+    def _moved(self, index: Tensor, offset: Tensor) -> Tensor:
+        """Positions of the grid's vertices after the offsets, (M, 3); those that must not move are exact."""
+        reach = _OFFSET_CELLS * self.grid.spacing * self._movable[index].to(offset.dtype)
+        return self.grid.positions(index, offset.dtype) + offset * reach[:, None]
+
+    def _on_edges(self, positions: Tensor, sdf: Tensor, part_minus_base: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        """Surface vertices (E, 3) and their part_weight (E,) on edges `ends` (2, E) between the given vertices."""
+        from_lower = sdf.detach()[ends[0]] > sdf.detach()[ends[1]]
+        inner = torch.where(from_lower, ends[0], ends[1])
+        outer = torch.where(from_lower, ends[1], ends[0])
+        fraction = crossing_fraction(sdf.index_select(0, inner), sdf.index_select(0, outer), self.grid.spacing)
+        start = positions.index_select(0, inner)
+        vertices = start + fraction[:, None] * (positions.index_select(0, outer) - start)
+        inner_lead, outer_lead = part_minus_base.index_select(0, inner), part_minus_base.index_select(0, outer)
+        lead = inner_lead + fraction * (outer_lead - inner_lead)
+        return vertices, (0.5 + lead / (2 * self.seam_width)).clamp(0, 1)
+
+
+def _faces_of_part(part_weight: Tensor, faces: Tensor) -> Tensor:
+    return part_weight.detach()[faces].mean(dim=1) > 0.5
+
+
+def _away_from_surface(sdf: Tensor) -> Tensor:
+    """The vertices of which all neighbours within the surrounding eight cells have the same sign, (z, y, x) bool."""
+    sign = (sdf > 0).float()[None, None]
+    highest = max_pool3d(sign, 3, stride=1, padding=1)
+    lowest = -max_pool3d(-sign, 3, stride=1, padding=1)
+    return (highest == lowest)[0, 0]

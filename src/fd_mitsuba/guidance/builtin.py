@@ -1,0 +1,49 @@
+"""Where the prior that is shipped with the package lies, and whether it is whole."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from fd_mitsuba.errors import UserError
+
+BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "prior" / "weights"
+SUMS_NAME = "SHA256SUMS"
+
+
+def builtin_folder(folder: Path = BUILTIN_FOLDER) -> Path:
+    """The pipeline folder of the built-in prior, after its files were checked against `SHA256SUMS` if that is there.
+
+    Raises:
+        UserError: no prior in this installation, a file missing or changed, an unreadable list of hashes.
+    """
+    if not (folder / "model_index.json").is_file():
+        raise UserError(
+            f"{folder}: this installation has no built-in prior; reinstall fd_mitsuba, or set guidance.model to a "
+            "Stable-Diffusion folder or hub id"
+        )
+    verify_hashes(folder)
+    return folder
+
+
+def verify_hashes(folder: Path) -> None:
+    """Compare files with `folder/SHA256SUMS` (lines "<64 hex digits>  <relative path>", as `sha256sum` writes them).
+
+    Raises:
+        UserError: a listed file is missing or differs, or a line cannot be read. Without the list nothing is checked.
+    """
+    sums = folder / SUMS_NAME
+    if not sums.is_file():
+        return
+    for number, line in enumerate(sums.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        expected, _, name = line.partition(" ")
+        name = name.strip().removeprefix("*")
+        if len(expected) != 64 or not name:
+            raise UserError(f"{sums}: line {number} is not a hash and a file name; reinstall fd_mitsuba")
+        path = folder / name
+        if not path.is_file():
+            raise UserError(f"{path}: file of the built-in prior is missing; reinstall fd_mitsuba")
+        if hashlib.sha256(path.read_bytes()).hexdigest() != expected.lower():
+            raise UserError(f"{path}: file of the built-in prior was changed or cut short; reinstall fd_mitsuba")

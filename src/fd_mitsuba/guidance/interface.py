@@ -1,0 +1,88 @@
+"""What the training stages know of a guidance: pictures in, out a loss whose gradient says "more like the text"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import torch
+
+from fd_mitsuba.conventions import GEOMETRY_CHANNELS
+from fd_mitsuba.errors import RunStopped
+
+Phase = Literal["coarse", "refined"]
+
+
+class NonFiniteGuidance(RunStopped):
+    """The guidance gradient has a NaN or an infinity; the message names the timesteps. The run cannot go on from it."""
+
+
+@dataclass(frozen=True)
+class GuidanceViews:
+    """Rendered views of one step, all with the same camera set.
+
+    Attributes:
+        pictures: geometry pictures (B, 5, H, W) of the edited object, channels as `conventions.GEOMETRY_CHANNELS`:
+            normal times coverage in [-1, 1], then coverages in [0, 1]. Gradients flow to them.
+        base: geometry pictures (B, 5, H, W) of the unedited base from the same cameras, or None. No gradients.
+        azimuth_deg: B azimuths. A model that sees a mosaic takes consecutive views as one mosaic.
+        elevation_deg: B elevations.
+        closeup: whether the cameras are centred on the focal regions and close.
+    """
+
+    pictures: torch.Tensor
+    base: torch.Tensor | None
+    azimuth_deg: Sequence[float]
+    elevation_deg: Sequence[float]
+    closeup: bool = False
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.pictures.shape)
+        if len(shape) != 4 or shape[1] != len(GEOMETRY_CHANNELS) or shape[2] != shape[3]:
+            raise ValueError(f"pictures must be (B, {len(GEOMETRY_CHANNELS)}, H, H), not {shape}")
+        if self.base is not None and tuple(self.base.shape) != shape:
+            raise ValueError(f"base pictures {tuple(self.base.shape)} must have the shape of the pictures, {shape}")
+        if not len(self.azimuth_deg) == len(self.elevation_deg) == shape[0]:
+            raise ValueError(f"{shape[0]} pictures need as many azimuths and elevations")
+
+
+@dataclass(frozen=True)
+class GuidanceResult:
+    """Attributes:
+    loss: scalar; its gradient with respect to the pictures is the guidance gradient, its value only a size to log.
+    logs: numbers for the metrics file.
+    preview: the model's estimate (N, 4, L, L) of the clean latents, one per picture or mosaic; no gradients.
+    """
+
+    loss: torch.Tensor
+    logs: dict[str, float] = field(default_factory=dict)
+    preview: torch.Tensor | None = None
+
+
+class Guidance(Protocol):
+    """A source of guidance. `DiffusionGuidance` is the one the package ships."""
+
+    needs_base: bool
+    """Whether `GuidanceViews.base` must be given."""
+    view_grid: int
+    """Pictures are mosaics of view_grid x view_grid views; the number of views must be a multiple of its square.
+
+    The views of a mosaic are consecutive, and view i looks from azimuth_deg[0] + 360 i / view_grid^2."""
+    normal_space: Literal["camera", "world"] | None
+    """Frame of the normals that the model was trained with; None: either will do."""
+
+    def picture_size(self, phase: Phase) -> int:
+        """Height and width in pixels at which the views of a phase must be rendered."""
+        ...
+
+    def set_prompt(self, prompt: str, negative_prompt: str = "") -> list[str]:
+        """Take the text to pull towards and the one to push away from; must be called before `guide`.
+
+        Returns the words that the model cannot know, which the user should be told.
+        """
+        ...
+
+    def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: Phase, seed: int) -> GuidanceResult:
+        """The loss of one step; `step` counts from 0 within the phase, `steps_total` is the phase's length."""
+        ...

@@ -1,0 +1,148 @@
+"""Whether a folder is a pipeline in Stable Diffusion's layout, told from its configs and file headers alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
+
+LAYOUT = "only Stable Diffusion 1.x/2.x and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
+WEIGHTS = {
+    "unet": "diffusion_pytorch_model",
+    "vae": "diffusion_pytorch_model",
+    "text_encoder": "model",
+}
+"""Components with weights, and the name of their file without its ending."""
+TOKENIZER_FILES = (("tokenizer.json",), ("vocab.json", "merges.txt"))
+CLASSES = {
+    "unet": {"UNet2DConditionModel"},
+    "vae": {"AutoencoderKL", "AutoencoderTiny"},
+    "text_encoder": {"CLIPTextModel"},
+    "tokenizer": {"CLIPTokenizer", "CLIPTokenizerFast", "PreTrainedTokenizerFast"},
+    "scheduler": None,
+}
+
+
+def read_layout(folder: Path) -> dict[str, Any]:
+    """`model_index.json` of a folder, after checking that it and its sub-folders have Stable Diffusion's layout."""
+    path = folder / "model_index.json"
+    if not path.is_file():
+        raise UserError(f"{folder}: has no model_index.json, so it is not a Diffusers pipeline folder; {LAYOUT}")
+    index = read_json(path)
+    name = index.get("_class_name", "of an unknown class")
+    if index.get("transformer") is not None:
+        raise UserError(f"{path}: the pipeline {name} is built on a transformer; {LAYOUT}")
+    if index.get("text_encoder_2") is not None:
+        raise UserError(f"{path}: the pipeline {name} has two text encoders (SDXL); {LAYOUT}")
+    for part, classes in CLASSES.items():
+        entry = index.get(part)
+        found = entry[1] if isinstance(entry, list) and len(entry) == 2 else None
+        if found is None:
+            raise UserError(f"{path}: the pipeline {name} has no {part}; {LAYOUT}")
+        if classes is not None and found not in classes:
+            raise UserError(f"{path}: {part} is a {found}, not a {' or '.join(sorted(classes))}; {LAYOUT}")
+    needed = [f"{part}/config.json" for part in WEIGHTS] + ["scheduler/scheduler_config.json", "tokenizer"]
+    for name in needed:
+        if not (folder / name).exists():
+            raise UserError(f"{folder / name}: missing from the pipeline folder; copy or fetch the whole model again")
+    tokenizer = folder / "tokenizer"
+    # Without these files transformers makes an empty tokenizer and says nothing.
+    if not any(all((tokenizer / name).is_file() for name in names) for names in TOKENIZER_FILES):
+        raise UserError(f"{tokenizer}: has neither tokenizer.json nor vocab.json and merges.txt; fetch the model again")
+    return index
+
+
+def weight_files(folder: Path, part: str) -> tuple[list[Path], str | None]:
+    """The safetensors files of a component and their variant (None, or `fp16` where only that is there).
+
+    Pickled weights (`.bin`, `.ckpt`) are refused: loading them runs whatever code they hold.
+    """
+    stem = WEIGHTS[part]
+    for variant in (None, "fp16"):
+        name = f"{stem}.safetensors" if variant is None else f"{stem}.{variant}.safetensors"
+        listing = f"{stem}.safetensors.index.json" if variant is None else f"{stem}.safetensors.index.{variant}.json"
+        if (folder / part / name).is_file():
+            return [folder / part / name], variant
+        if (folder / part / listing).is_file():
+            shards = sorted(set(read_json(folder / part / listing).get("weight_map", {}).values()))
+            missing = [shard for shard in shards if not (folder / part / shard).is_file()]
+            if missing:
+                raise UserError(f"{folder / part / missing[0]}: missing from the pipeline folder; fetch it again")
+            return [folder / part / shard for shard in shards], variant
+    if any(path.suffix in (".bin", ".ckpt", ".pt") for path in (folder / part).iterdir()):
+        raise UserError(
+            f"{folder / part}: has pickled weights only, which can run code; convert them to {stem}.safetensors"
+        )
+    raise UserError(f"{folder / part / stem}.safetensors: missing from the pipeline folder; fetch the model again")
+
+
+def count_weights(path: Path) -> int:
+    """Number of values in a safetensors file, read from its header alone.
+
+    Raises:
+        UserError: damaged or cut short (the header's offsets must cover the file).
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as tensors:
+            return sum(torch.Size(tensors.get_slice(key).get_shape()).numel() for key in tensors.keys())  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{path}: damaged weights ({first_line(error)}); copy or fetch the file again") from None
+
+
+def latent_side(unet_config: dict[str, Any]) -> int:
+    """Side of the latents the UNet was trained at; a UNet that does not say is taken for 64."""
+    size = unet_config.get("sample_size") or 64
+    return int(size if isinstance(size, int) else size[0])
+
+
+def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: ModelConventions) -> None:
+    unet, vae, text = (configs[part] for part in ("unet", "vae", "text_encoder"))
+    path = folder / "unet" / "config.json"
+    channels, latent = unet.get("in_channels", 4), vae.get("latent_channels", 4)
+    if channels not in (4, 8):
+        kind = "an inpainting UNet" if channels == 9 else "not supported"
+        raise UserError(f"{path}: in_channels is {channels} ({kind}); take a model with 4, or 8 (InstructPix2Pix)")
+    if latent != 4 or unet.get("out_channels", 4) != 4:
+        raise UserError(f"{path}: UNet and VAE must share 4 latent channels; take a Stable Diffusion 1.x/2.x model")
+    if not isinstance(unet.get("sample_size") or 64, int) and len(set(unet["sample_size"])) != 1:
+        raise UserError(f"{path}: sample_size {unet['sample_size']} is not square; take a model with square pictures")
+    for key in ("addition_embed_type", "class_embed_type", "encoder_hid_dim"):
+        if unet.get(key) is not None:
+            raise UserError(f"{path}: {key} = {unet[key]!r} asks for a condition beside the text; {LAYOUT}")
+    width, wanted = text.get("hidden_size", 512), unet.get("cross_attention_dim", 1280)
+    if width != wanted:
+        raise UserError(
+            f"{path}: cross_attention_dim {wanted} does not fit the text encoder's hidden_size {width}; {LAYOUT}"
+        )
+    if latent_side(unet) % conventions.view_grid:
+        raise UserError(
+            f"{folder / FILE_NAME}: view_grid {conventions.view_grid} does not divide the latents' side "
+            f"{latent_side(unet)}; mend view_grid"
+        )
+    if conventions.needs_base is not None and conventions.needs_base != (channels == 8):
+        raise UserError(
+            f"{folder / FILE_NAME}: needs_base is {conventions.needs_base} but the UNet has {channels} input "
+            "channels; mend needs_base"
+        )
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not readable JSON ({first_line(error)}); copy or fetch the file again") from None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: must hold a JSON object; copy or fetch the file again")
+    return data
+
+
+def first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if lines else type(error).__name__)[:200]

@@ -1,0 +1,215 @@
+"""From a model's name to loaded components: a folder, a hub id or `builtin`, checked before anything is loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.builtin import builtin_folder
+from fd_mitsuba.guidance.layout import (
+    LAYOUT,
+    WEIGHTS,
+    check_sizes,
+    count_weights,
+    first_line,
+    latent_side,
+    read_json,
+    read_layout,
+    weight_files,
+)
+from fd_mitsuba.guidance.memory import BYTES, require_memory, working_set_bytes
+from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
+
+HUB_FILES = ["model_index.json", FILE_NAME, "tokenizer/*", "scheduler/*.json"] + [
+    f"{part}/{name}" for part, stem in WEIGHTS.items() for name in ("config.json", f"{stem}*.safetensors*")
+]
+
+
+@dataclass(frozen=True)
+class Components:
+    """The parts of a pipeline, in evaluation mode, without gradients in the weights."""
+
+    tokenizer: Any
+    text_encoder: torch.nn.Module
+    unet: torch.nn.Module
+    vae: torch.nn.Module
+    scheduler: Any
+    conventions: ModelConventions
+    folder: Path
+
+
+def load_components(config: GuidanceConfig, device: str = "cpu") -> Components:
+    """The components of `config.model`, in `config.dtype` (the VAE in float32, since gradients flow through it).
+
+    Raises:
+        UserError: one line that names the file and what to do, for a folder or hub id that does not exist, a layout
+            other than Stable Diffusion's, a missing or damaged file, weights that do not fit the config, no memory.
+    """
+    folder = locate(config.model)
+    index = read_layout(folder)
+    configs = {part: read_json(folder / part / "config.json") for part in WEIGHTS}
+    conventions = read_model_conventions(folder)
+    check_sizes(folder, configs, conventions)
+    files = {part: weight_files(folder, part) for part in WEIGHTS}
+    counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
+    size = BYTES[config.dtype]
+    latent_size = latent_side(configs["unet"])
+    require_memory(
+        counts["unet"] * size + counts["text_encoder"] * size + counts["vae"] * 4,
+        working_set_bytes(configs["unet"], configs["vae"], latent_size, config.views_per_call, config.dtype),
+        device,
+        str(folder),
+    )
+    return _load(folder, index, {part: variant for part, (_, variant) in files.items()}, config, conventions, device)
+
+
+def locate(model: str) -> Path:
+    """The folder of a model name: `builtin`, an existing folder, or a snapshot of a hub id (fetched, unless offline).
+
+    `HF_HUB_OFFLINE=1` keeps to what is in the hub's cache.
+    """
+    if model == "builtin":
+        return builtin_folder()
+    folder = Path(model).expanduser()
+    if folder.is_dir():
+        return folder
+    if folder.exists():
+        raise UserError(f"{folder}: is a file; guidance.model takes a folder in Stable-Diffusion layout or a hub id")
+    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", model):
+        raise UserError(
+            f"{model}: no such folder; guidance.model is 'builtin', a pipeline folder or a hub id owner/name"
+        )
+    return _snapshot(model)
+
+
+def _snapshot(model: str) -> Path:
+    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    offline = constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on")
+    try:
+        folder = Path(
+            snapshot_download(
+                model,
+                allow_patterns=HUB_FILES,
+                ignore_patterns=["*.fp16.*", "*.non_ema.*", "*.bf16.*"],
+                local_files_only=offline,
+            )
+        )
+        if not offline and (folder / "model_index.json").is_file() and not _has_plain_weights(folder):
+            folder = Path(snapshot_download(model, allow_patterns=HUB_FILES, ignore_patterns=["*.non_ema.*"]))
+        return folder
+    except LocalEntryNotFoundError:
+        reason = "HF_HUB_OFFLINE is set and it is not in the cache" if offline else "not in the cache, no connection"
+        raise UserError(
+            f"{model}: neither a folder here nor a hub model that is at hand ({reason}); give a folder, or fetch the "
+            "model once while online"
+        ) from None
+    except Exception as error:  # the hub client raises many kinds: unknown id, gated, no network, disk full
+        raise UserError(
+            f"{model}: neither a folder here nor fetched from the hub ({first_line(error)}); check the id, or "
+            "give a folder"
+        ) from None
+
+
+def _has_plain_weights(folder: Path) -> bool:
+    return all(
+        any((folder / part / f"{stem}.safetensors{ending}").is_file() for ending in ("", ".index.json"))
+        for part, stem in WEIGHTS.items()
+    )
+
+
+def _load(
+    folder: Path,
+    index: dict[str, Any],
+    variants: dict[str, str | None],
+    config: GuidanceConfig,
+    conventions: ModelConventions,
+    device: str,
+) -> Components:
+    import diffusers
+    import transformers
+
+    dtype = getattr(torch, config.dtype)
+    scheduler_class = getattr(diffusers, index["scheduler"][1], None)
+    if scheduler_class is None:
+        raise UserError(
+            f"{folder / 'model_index.json'}: unknown scheduler {index['scheduler'][1]}; name a DDIMScheduler"
+        )
+    loaded: dict[str, Any] = {}
+    for part, owner, kind in (
+        ("unet", diffusers.UNet2DConditionModel, dtype),
+        ("vae", getattr(diffusers, index["vae"][1]), torch.float32),
+        ("text_encoder", transformers.CLIPTextModel, dtype),
+    ):
+        key = "torch_dtype" if part != "text_encoder" else "dtype"
+        with _one_line(folder / part), _quiet():
+            model, info = owner.from_pretrained(
+                str(folder / part),
+                variant=variants[part],
+                use_safetensors=True,
+                local_files_only=True,
+                output_loading_info=True,
+                **{key: kind},
+            )
+        missing = sorted(info["missing_keys"])
+        if missing:
+            raise UserError(
+                f"{folder / part}: the weights lack {len(missing)} tensors, {missing[0]} first; fetch the file again"
+            )
+        loaded[part] = model.requires_grad_(False).eval().to(device)
+    with _one_line(folder / "tokenizer"), _quiet():
+        # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
+        generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
+        kind = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
+        tokenizer = kind.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
+    known = loaded["text_encoder"].config.vocab_size
+    if len(tokenizer) > known:
+        raise UserError(
+            f"{folder / 'tokenizer'}: has {len(tokenizer)} words, the text encoder knows {known}; fetch the model again"
+        )
+    with _one_line(folder / "scheduler"), _quiet():
+        scheduler = scheduler_class.from_pretrained(str(folder / "scheduler"), local_files_only=True)
+    if not hasattr(scheduler, "alphas_cumprod"):
+        raise UserError(f"{folder / 'scheduler'}: {index['scheduler'][1]} has no noise levels alphas_cumprod; {LAYOUT}")
+    return Components(tokenizer, loaded["text_encoder"], loaded["unet"], loaded["vae"], scheduler, conventions, folder)
+
+
+@contextlib.contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Turn whatever the libraries raise on a file that does not fit its config into one line that names the place."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{path}: cannot be loaded ({first_line(error)}); copy or fetch the model again") from None
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """No progress bars and remarks of the libraries while a component loads; what matters is checked here."""
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
+
+    levels = [(library, library.get_verbosity()) for library in (diffusers_logging, transformers_logging)]
+    bar = transformers_logging.is_progress_bar_enabled()
+    for library, _ in levels:
+        library.set_verbosity_error()
+    transformers_logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for library, level in levels:
+            library.set_verbosity(level)
+        if bar:
+            transformers_logging.enable_progress_bar()

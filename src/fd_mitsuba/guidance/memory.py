@@ -1,0 +1,100 @@
+"""Whether a pipeline fits: bytes of weights and working set against what the machine can still give."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fd_mitsuba.errors import UserError
+
+BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
+
+VAE_TENSORS = 7
+"""Feature maps per resnet block that an encoder's backward pass keeps: 3.3 GB for a 512 x 512 picture and SD 1.5."""
+UNET_TENSORS = 50
+"""Feature maps at the first width that a forward pass holds: 0.26 GB for a picture at 64 x 64 and SD 1.5's UNet."""
+
+
+def available_bytes(device: str = "cpu") -> int | None:
+    """Bytes that can still be allocated on a device; for the CPU what is free or reclaimable within the cgroup's limit.
+
+    None where the system does not say.
+    """
+    if torch.device(device).type == "cuda":
+        return torch.cuda.mem_get_info(torch.device(device))[0]
+    amounts = [_meminfo_available() or _sysconf_available(), _cgroup_available()]
+    known = [amount for amount in amounts if amount is not None]
+    return min(known) if known else None
+
+
+def _meminfo_available() -> int | None:
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        pass
+    return None
+
+
+def _sysconf_available() -> int | None:
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _cgroup_available(root: Path = Path("/sys/fs/cgroup")) -> int | None:
+    try:
+        limit = int((root / "memory.max").read_text())
+        used = int((root / "memory.current").read_text())
+        # The page cache counts as used but is given up under pressure.
+        statistics = dict(line.split() for line in (root / "memory.stat").read_text().splitlines())
+        return limit - used + int(statistics.get("inactive_file", 0))
+    except (OSError, ValueError):
+        return None
+
+
+def working_set_bytes(unet: dict[str, Any], vae: dict[str, Any], latent_size: int, batch: int, dtype: str) -> int:
+    """Rough bytes beside the weights: one UNet forward pass of `batch` pictures, and the VAE encoder's backward pass.
+
+    Args:
+        unet, vae: the components' own configs.
+        latent_size: side of the latents.
+        batch: pictures in one call of the UNet. The encoder sees half of them, since guidance takes two passes or more.
+        dtype: of the UNet; the VAE is float32.
+    """
+    widths = unet.get("block_out_channels", (320,))
+    unet_bytes = UNET_TENSORS * widths[0] * latent_size**2 * BYTES[dtype]
+    # AutoencoderTiny names its encoder's widths and blocks one by one, AutoencoderKL has one count for all.
+    widths = vae.get("encoder_block_out_channels") or vae.get("block_out_channels", (128,))
+    blocks = vae.get("num_encoder_blocks") or [vae.get("layers_per_block", 2)] * len(widths)
+    side = latent_size * 2 ** (len(widths) - 1)
+    vae_bytes = sum(
+        VAE_TENSORS * count * width * (side // 2**level) ** 2 * 4
+        for level, (width, count) in enumerate(zip(widths, blocks, strict=False))
+    )
+    return batch * unet_bytes + max(1, batch // 2) * vae_bytes
+
+
+def require_memory(needed_weights: int, working_set: int, device: str, source: str) -> None:
+    """Refuse, before anything is loaded, a pipeline that will not fit.
+
+    Raises:
+        UserError: naming both numbers and what to change.
+    """
+    available = available_bytes(device)
+    needed = needed_weights + working_set
+    if available is not None and needed > available:
+        raise UserError(
+            f"{source}: needs about {_gigabytes(needed)} ({_gigabytes(needed_weights)} of weights, "
+            f"{_gigabytes(working_set)} to work in) but {device} has {_gigabytes(available)} left; lower "
+            "guidance.views_per_call, set guidance.dtype to bfloat16, or take a smaller model such as builtin"
+        )
+
+
+def _gigabytes(count: int) -> str:
+    return f"{count / 1e9:.2f} GB"

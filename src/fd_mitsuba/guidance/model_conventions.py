@@ -1,0 +1,65 @@
+"""What a pipeline's weights were trained with: the optional `fd_mitsuba.json` beside `model_index.json`."""
+
+from __future__ import annotations
+
+import string
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from fd_mitsuba.errors import UserError
+
+FILE_NAME = "fd_mitsuba.json"
+TEMPLATE_FIELDS = {"prompt", "view", "closeup"}
+
+
+class ModelConventions(BaseModel):
+    """Conventions of the weights; the defaults fit a stock Stable Diffusion model."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    view_grid: Annotated[int, Field(ge=1, le=4)] = 1
+    """Pictures are mosaics of view_grid x view_grid views, row by row from the top left, azimuths evenly spread."""
+    normal_space: Literal["camera", "world"] | None = None
+    """Frame of the normals in the training pictures; None: the weights do not care."""
+    needs_base: bool | None = None
+    """If given, must agree with the UNet: 8 input channels take the base's picture as condition, 4 do not."""
+    prompt_template: str = "{prompt}, {closeup}, {view}"
+    """Comma-separated items of {prompt}, {view}, {closeup} and fixed words; an item that comes out empty is dropped."""
+    view_words: tuple[str, ...] = ()
+    """One word per azimuth bin. Empty: "front view", "side view", "back view" for pictures, nothing for mosaics."""
+    view_start_deg: float | None = None
+    """Where bin 0 of `view_words` starts. Default: minus half a bin (centred on the front), but 0 for mosaics."""
+    closeup_word: str = ""
+    """What {closeup} becomes for views that are centred on the focal regions and close."""
+    whole_words: bool = False
+    """The tokenizer knows whole words only, so that a word it must split is one the model never saw."""
+    about: dict[str, Any] = {}
+    """Free remarks (training data, licence); not read."""
+
+    @model_validator(mode="after")
+    def _template_fields_exist(self) -> ModelConventions:
+        fields = {name for _, name, _, _ in string.Formatter().parse(self.prompt_template) if name is not None}
+        if "prompt" not in fields or not fields <= TEMPLATE_FIELDS:
+            raise ValueError("prompt_template must use {prompt} and may use {view} and {closeup}")
+        return self
+
+
+def read_model_conventions(folder: Path) -> ModelConventions:
+    """The conventions in `folder/fd_mitsuba.json`, or the defaults without that file.
+
+    Raises:
+        UserError: not JSON, an unknown key, a value of the wrong type.
+    """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        return ModelConventions()
+    try:
+        return ModelConventions.model_validate_json(path.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        problem = error.errors()[0]
+        key = ".".join(str(part) for part in problem["loc"])
+        raise UserError(f"{path}: {key + ': ' if key else ''}{problem['msg']}; mend or remove the file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read ({error}); mend or remove the file") from None

@@ -1,0 +1,19 @@
+"""Several views as one picture, for models that were trained to draw an object from all sides at once."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def tile_views(pictures: Tensor, grid: int) -> Tensor:
+    """Mosaics (B / grid^2, C, grid H, grid W) of consecutive pictures (B, C, H, W), row by row from the top left.
+
+    Gradients flow. `grid` 1 returns the pictures as they are.
+    """
+    count, channels, height, width = pictures.shape
+    if count % grid**2:
+        raise ValueError(f"{count} views do not fill mosaics of {grid} x {grid}; give a multiple of {grid**2}")
+    if grid == 1:
+        return pictures
+    rows = pictures.reshape(count // grid**2, grid, grid, channels, height, width)
+    return rows.permute(0, 3, 1, 4, 2, 5).reshape(-1, channels, grid * height, grid * width)

@@ -1,0 +1,149 @@
+"""Score distillation as plain tensor functions: no model, no prompt, no state.
+
+Symbols: z clean latents, e noise, t timestep, `alpha_bar` the scheduler's cumulative product of alphas at t, so that
+    z_t = sqrt(alpha_bar) z + sqrt(1 - alpha_bar) e.
+Latents are (N, C, H, W); everything per timestep is (N,) and is broadcast here.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Weighting = Literal["sds", "uniform", "fantasia3d", "inverse"]
+PredictionType = Literal["epsilon", "v_prediction", "sample"]
+
+
+def _per_latent(values: Tensor) -> Tensor:
+    return values.view(-1, 1, 1, 1)
+
+
+def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
+    """w(t), which the paper leaves open, for each alpha_bar.
+
+    `sds`: 1 - alpha_bar (DreamFusion); `uniform`: 1; `fantasia3d`: sqrt(alpha_bar) (1 - alpha_bar);
+    `inverse`: 1 / (1 - alpha_bar).
+    """
+    if weighting == "sds":
+        return 1 - alpha_bar
+    if weighting == "uniform":
+        return torch.ones_like(alpha_bar)
+    if weighting == "fantasia3d":
+        return alpha_bar.sqrt() * (1 - alpha_bar)
+    if weighting == "inverse":
+        return 1 / (1 - alpha_bar)
+    raise ValueError(f"unknown weighting {weighting!r}")
+
+
+def annealed_range(timestep_range: tuple[float, float], anneal: float, progress: float) -> tuple[float, float]:
+    """The range of t after its upper end came down by anneal * progress of the range's width; progress in [0, 1]."""
+    low, high = timestep_range
+    return low, high - anneal * progress * (high - low)
+
+
+def draw_timesteps(bounds: tuple[float, float], train_timesteps: int, count: int, generator: torch.Generator) -> Tensor:
+    """`count` timesteps (int64, CPU), t ~ U[t_0, t_final] (paper, supplement "Score Distillation Sampling Settings").
+
+    `bounds` are fractions of the scheduler's training timesteps; the draw is kept inside [1, train_timesteps - 1].
+    """
+    low, high = (round(bound * (train_timesteps - 1)) for bound in bounds)
+    draw = torch.rand(count, generator=generator, dtype=torch.float64)
+    timesteps = (low + draw * (high - low + 1)).floor().long().clamp(max=high)
+    return timesteps.clamp(1, train_timesteps - 1)
+
+
+def add_noise(z: Tensor, noise: Tensor, alpha_bar: Tensor) -> Tensor:
+    """z_t = sqrt(alpha_bar) z + sqrt(1 - alpha_bar) e (DDPM's forward process)."""
+    abar = _per_latent(alpha_bar)
+    return abar.sqrt() * z + (1 - abar).sqrt() * noise
+
+
+def noise_from_prediction(prediction: Tensor, z_t: Tensor, alpha_bar: Tensor, kind: PredictionType) -> Tensor:
+    """The noise e_hat that a network's output stands for.
+
+    v = sqrt(alpha_bar) e - sqrt(1 - alpha_bar) z  gives  e = sqrt(alpha_bar) v + sqrt(1 - alpha_bar) z_t
+    (progressive distillation); `sample` is a prediction of z itself.
+    """
+    abar = _per_latent(alpha_bar)
+    if kind == "epsilon":
+        return prediction
+    if kind == "v_prediction":
+        return abar.sqrt() * prediction + (1 - abar).sqrt() * z_t
+    if kind == "sample":
+        return (z_t - abar.sqrt() * prediction) / (1 - abar).sqrt()
+    raise ValueError(f"unknown prediction type {kind!r}")
+
+
+def clean_estimate(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor) -> Tensor:
+    """z_hat = (z_t - sqrt(1 - alpha_bar) e_hat) / sqrt(alpha_bar): the clean latents that e_hat implies."""
+    abar = _per_latent(alpha_bar)
+    return (z_t - (1 - abar).sqrt() * noise_hat) / abar.sqrt().clamp(min=1e-4)
+
+
+def cfg_coefficients(scale: float) -> dict[str, float]:
+    """Classifier-free guidance as a sum over passes of the network: e_hat = sum of coefficient * e(pass).
+
+        e_hat = e(plain) + scale (e(text) - e(plain))
+
+    `plain` reads the negative prompt. This is diffusers' writing; DreamFusion's text + s (text - plain) has
+    scale = s + 1. A pass whose coefficient is 0 is left out, so that scale = 1 costs one pass.
+    """
+    return _nonzero({"text": scale, "plain": 1 - scale})
+
+
+def cfg_coefficients_with_image(text_scale: float, image_scale: float) -> dict[str, float]:
+    """The same with a text and an image as conditions (InstructPix2Pix, equation 3).
+
+        e_hat = e(plain) + image_scale (e(image) - e(plain)) + text_scale (e(text) - e(image))
+
+    `text` sees image and text, `image` the image and the negative prompt, `plain` a zero image and the negative prompt.
+    """
+    return _nonzero({"text": text_scale, "image": image_scale - text_scale, "plain": 1 - image_scale})
+
+
+def _nonzero(coefficients: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in coefficients.items() if value != 0}
+
+
+def combine(predictions: dict[str, Tensor], coefficients: dict[str, float]) -> Tensor:
+    """Sum of coefficient times prediction over the passes that `coefficients` names."""
+    return sum(value * predictions[name] for name, value in coefficients.items())  # type: ignore[return-value]
+
+
+def sds_gradient(noise_hat: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
+    """w(t) (e_hat - e), with respect to z (paper, section "Preliminary", the SDS equation)."""
+    return _per_latent(weights) * (noise_hat - noise)
+
+
+def csd_gradient(noise_text: Tensor, noise_plain: Tensor, weights: Tensor) -> Tensor:
+    """w(t) (e(text) - e(plain)): only the part of the score that the text explains (classifier score distillation)."""
+    return _per_latent(weights) * (noise_text - noise_plain)
+
+
+def reconstruction_gradient(z: Tensor, z_hat: Tensor, weights: Tensor) -> Tensor:
+    """w(t) (z - z_hat): towards the denoised latents (the gradient of w/2 |z - z_hat|^2 with z_hat held fixed).
+
+    With z_hat from one denoising step this is SDS with its weight times sqrt((1 - alpha_bar) / alpha_bar).
+    """
+    return _per_latent(weights) * (z - z_hat)
+
+
+def ddim_step(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor, alpha_bar_next: Tensor) -> Tensor:
+    """Latents at the next, less noisy level: add_noise(z_hat, e_hat, alpha_bar_next) (DDIM with eta 0)."""
+    return add_noise(clean_estimate(z_t, noise_hat, alpha_bar), noise_hat, alpha_bar_next)
+
+
+def normalising_scale(gradient: Tensor) -> float:
+    """1 / mean |g|: a gradient times this has mean size 1, so that step sizes do not depend on t."""
+    return 1 / max(float(gradient.abs().mean()), torch.finfo(gradient.dtype).tiny)
+
+
+def carry_gradient(inputs: Tensor, gradient: Tensor, value: float) -> Tensor:
+    """A scalar with the given value whose gradient with respect to `inputs` is exactly `gradient`.
+
+    The same as 0.5 |x - (x - g).detach()|^2, without the rounding of x - (x - g) where g is small beside x.
+    """
+    inner = (inputs * gradient.detach()).sum()
+    return inner - inner.detach() + value

@@ -1,0 +1,67 @@
+"""Pinhole cameras of a whole batch inside one Dr.Jit wavefront: film to ray, and point to film.
+
+Film coordinates are pixels: x to the right, y downwards, (0, 0) the picture's top left corner. Depth is the distance
+along the viewing axis, positive in front of the camera. Nothing here is differentiable in the cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from fd_mitsuba.render.upload import upload_floats
+from fd_mitsuba.scene.views import CameraBatch
+
+
+@dataclass(frozen=True)
+class FilmCamera:
+    """One camera a lane: axes, position, and half the film's width at depth 1."""
+
+    right: mi.Vector3f
+    up: mi.Vector3f
+    back: mi.Vector3f
+    position: mi.Point3f
+    half_width: mi.Float
+    size: int
+
+    def ray(self, film: mi.Point2f) -> mi.Ray3f:
+        """The ray through a film point; its parameter t is the depth (the direction is not of unit length)."""
+        x = (film.x * (2.0 / self.size) - 1.0) * self.half_width
+        y = (1.0 - film.y * (2.0 / self.size)) * self.half_width
+        return mi.Ray3f(self.position, x * self.right + y * self.up - self.back)
+
+    def film(self, point: mi.Point3f) -> mi.Point2f:
+        """Where a point in front of the camera lies on the film; differentiable in the point."""
+        offset = point - self.position
+        scale = 0.5 * self.size / (-dr.dot(self.back, offset) * self.half_width)
+        centre = 0.5 * self.size
+        return mi.Point2f(centre + dr.dot(self.right, offset) * scale, centre - dr.dot(self.up, offset) * scale)
+
+    def to_camera_space(self, vector: mi.Vector3f) -> mi.Vector3f:
+        """A direction of the canonical frame, seen by this camera: x right, y up, z to the viewer."""
+        return mi.Vector3f(dr.dot(self.right, vector), dr.dot(self.up, vector), dr.dot(self.back, vector))
+
+
+class FilmCameras:
+    """A `CameraBatch` for pictures of `size` x `size` pixels, uploaded once per pass."""
+
+    def __init__(self, cameras: CameraBatch, size: int) -> None:
+        right, up, back = cameras.basis()
+        self.count, self.size = len(cameras), size
+        self.axes = np.stack([right, up, back], axis=1).astype(np.float64)
+        self.position = np.asarray(cameras.position, dtype=np.float64)
+        self.half_width = np.tan(np.radians(cameras.fov_deg.astype(np.float64)) / 2)
+        self._vectors = [_upload(v) for v in (right, up, back, cameras.position)]
+        self._half_width = upload_floats(self.half_width)
+
+    def at(self, view: mi.UInt32) -> FilmCamera:
+        """The cameras of the given views (B of them are numbered from 0)."""
+        right, up, back, position = (dr.gather(mi.Vector3f, v, view) for v in self._vectors)
+        return FilmCamera(right, up, back, mi.Point3f(position), dr.gather(mi.Float, self._half_width, view), self.size)
+
+
+def _upload(vectors: np.ndarray) -> mi.Vector3f:
+    return mi.Vector3f(*(upload_floats(vectors[:, axis]) for axis in range(3)))

@@ -1,0 +1,181 @@
+"""Pictures of a surface for the guidance: normals, object mask and part mask of several views, with true gradients."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import torch
+
+from fd_mitsuba import mitsuba_api
+from fd_mitsuba.conventions import GEOMETRY_CHANNELS
+from fd_mitsuba.render import bridge
+from fd_mitsuba.render.boundary_term import add_boundary_term
+from fd_mitsuba.render.cameras import FilmCameras
+from fd_mitsuba.render.mesh_check import check_mesh
+from fd_mitsuba.render.mesh_tracer import MeshTracer
+from fd_mitsuba.render.outline_points import sample_outline
+from fd_mitsuba.render.silhouette import SilhouetteFinder
+from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
+from fd_mitsuba.render.upload import upload_indices
+from fd_mitsuba.scene.views import CameraBatch
+
+_CHANNELS = len(GEOMETRY_CHANNELS)
+_RAYS_AT_ONCE = 1 << 22
+
+
+class GeometryPass:
+    """Renders geometry pictures of one size. Make it once and call it at every step: it keeps its Mitsuba scenes.
+
+    Args:
+        size: pictures are `size` x `size` pixels. Another size compiles other kernels; keep one object for each.
+        spp: samples a pixel for the pictures, jittered, box filter.
+        silhouette_spp: outline points a view, per pixel of the picture; 0 leaves the outline's gradient out.
+        normal_space: the frame of the normals, `camera` or `world` (here: the canonical frame).
+    """
+
+    def __init__(self, size: int, spp: int = 4, silhouette_spp: int = 1, normal_space: NormalSpace = "camera") -> None:
+        if size < 1 or spp < 1 or silhouette_spp < 0 or normal_space not in ("camera", "world"):
+            raise ValueError(
+                f"size = {size}, spp = {spp}, silhouette_spp = {silhouette_spp}, normal_space = {normal_space!r}: "
+                "sizes and samples must be positive, normal_space camera or world"
+            )
+        mitsuba_api.start(mi.variant() or mitsuba_api.DEFAULT_VARIANT)
+        self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
+        self._tracer, self._silhouettes = MeshTracer(), SilhouetteFinder()
+
+    @property
+    def static_builds(self) -> int:
+        """How often the static faces were sent to the ray tracer: 1 as long as they stay the same."""
+        return self._tracer.static_builds
+
+    def render(
+        self,
+        vertices: torch.Tensor,
+        faces: torch.Tensor,
+        part_weight: torch.Tensor,
+        cameras: CameraBatch,
+        seed: int,
+        static_faces: int = 0,
+    ) -> torch.Tensor:
+        """Pictures (B, 5, size, size) with the channels of `GEOMETRY_CHANNELS`, zero where there is nothing.
+
+        Gradients flow to `vertices` (inside the surface and at every visible outline: against the background and of one
+        piece before another) and to `part_weight`; not to the cameras. They need a closed, welded surface with outward
+        winding and cameras outside of it. An empty mesh gives blank pictures and zero gradients.
+
+        Args:
+            vertices: (V, 3) float32, canonical frame.
+            faces: (F, 3) int64.
+            part_weight: (V,) float32 in [0, 1].
+            cameras: B views.
+            seed: view b uses the random numbers of `seed + b`, so leave room for B between the seeds of two calls.
+            static_faces: how many faces at the head of the list, with their vertices, are the same as in the last call;
+                they are neither sent to the ray tracer nor searched for edges again. Their vertices should come first,
+                too. This is checked: a difference costs time only.
+
+        Raises:
+            ValueError: wrong shapes, an index out of range, a value that is not finite, vertices not welded, winding
+                not consistent, or more samples than fit one call.
+        """
+        mesh = check_mesh(vertices, faces, part_weight, static_faces)
+        shape = (len(cameras), _CHANNELS, self.size, self.size)
+        if not len(mesh.faces):
+            return (vertices.sum() + part_weight.sum()) * 0.0 + torch.zeros(shape)
+        if shape[0] * self.size**2 * max(self.spp, self.silhouette_spp) >= 2**32:
+            raise ValueError(f"{shape[0]} views of {self.size}^2 pixels and {self.spp} samples: too many for one call")
+        views = FilmCameras(cameras, self.size)
+        wanted = torch.is_grad_enabled() and vertices.requires_grad and self.silhouette_spp > 0
+        self._tracer.set_mesh(mesh.vertices, mesh.faces, mesh.static_faces)
+
+        def draw(positions: mi.Float, weights: mi.Float) -> mi.Float:
+            surface = ShadedMesh.create(positions, upload_indices(mesh.faces), weights)
+            picture = self._interior(surface, views, self.spp, seed)
+            if wanted:
+                outline = self._silhouettes.outline(mesh.vertices, mesh.faces, views, mesh.static_faces)
+                points = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
+                add_boundary_term(picture, surface, self._tracer, views, points, self.normal_space)
+            return _join(picture)
+
+        flat = bridge.differentiable(draw, vertices, part_weight)
+        return flat.reshape(_CHANNELS, shape[0], self.size, self.size).transpose(0, 1)
+
+    def render_primal(
+        self,
+        vertices: torch.Tensor,
+        faces: torch.Tensor,
+        part_weight: torch.Tensor,
+        cameras: CameraBatch,
+        seed: int,
+        spp: int | None = None,
+        static_faces: int = 0,
+    ) -> torch.Tensor:
+        """The same pictures without gradients, with any number of views and samples: they are traced in portions.
+
+        With the `spp` of the pass (None) the values are those of `render`.
+
+        Raises:
+            ValueError: as `render`.
+        """
+        mesh = check_mesh(vertices, faces, part_weight, static_faces)
+        count = len(cameras)
+        pictures = torch.zeros(count, _CHANNELS, self.size, self.size)
+        if not len(mesh.faces):
+            return pictures
+        spp = self.spp if spp is None else spp
+        rounds = -(-spp * self.size**2 // _RAYS_AT_ONCE)
+        samples = -(-spp // rounds)
+        together = max(1, _RAYS_AT_ONCE // (samples * self.size**2))
+        self._tracer.set_mesh(mesh.vertices, mesh.faces, mesh.static_faces)
+        for begin in range(0, count, together):
+            views = FilmCameras(_some(cameras, begin, begin + together), self.size)
+
+            def draw(positions: mi.Float, weights: mi.Float, views: FilmCameras = views, at: int = begin) -> mi.Float:
+                surface = ShadedMesh.create(positions, upload_indices(mesh.faces), weights)
+                total = [mi.Float(0)] * _CHANNELS
+                for turn in range(rounds):
+                    part = self._interior(surface, views, samples, seed + at + turn * 1_000_003)
+                    total = [old + new / rounds for old, new in zip(total, part, strict=True)]
+                    dr.eval(total)
+                return _join(total)
+
+            with torch.no_grad():
+                flat = bridge.differentiable(draw, vertices, part_weight)
+            portion = flat.reshape(_CHANNELS, views.count, self.size, self.size).transpose(0, 1)
+            pictures[begin : begin + views.count] = portion
+        return pictures
+
+    def _interior(self, mesh: ShadedMesh, cameras: FilmCameras, spp: int, seed: int) -> list[mi.Float]:
+        """Five arrays of B size^2 pixels: averages over jittered samples, attached."""
+        pixels = self.size**2
+        lane = dr.arange(mi.UInt32, cameras.count * pixels * spp)
+        place, view = lane // spp, lane // (spp * pixels)
+        camera = cameras.at(view)
+        ray = camera.ray(self._film_position(place % pixels, lane % spp, spp, view + _opaque(seed)))
+        hit = self._tracer.trace(ray, coherent=True)
+        samples = shade_hit(mesh, ray, hit, camera, self.normal_space)
+        dr.eval(samples)  # together: the sums below would each repeat the shading
+        # The samples of a pixel are neighbours: their sum has a fixed order, unlike atomic additions.
+        return [dr.block_sum(sample, spp) / spp for sample in samples]
+
+    def _film_position(self, pixel: mi.UInt32, sample: mi.UInt32, spp: int, seed: mi.UInt32) -> mi.Point2f:
+        """A Hammersley set in every pixel, shifted by that pixel's own random numbers."""
+        shift = mi.sample_tea_32(seed, pixel)
+        x = sample * ((2**32 - 1) // spp) + shift[0]
+        y = dr.brev(sample) + shift[1]
+        x, y = (mi.Float(value >> 8) * 2.0**-24 for value in (x, y))
+        return mi.Point2f(mi.Float(pixel % self.size) + x, mi.Float(pixel // self.size) + y)
+
+
+def _some(cameras: CameraBatch, begin: int, end: int) -> CameraBatch:
+    names = ("position", "target", "fov_deg", "azimuth_deg", "elevation_deg")
+    return CameraBatch(**{name: getattr(cameras, name)[begin:end] for name in names})
+
+
+def _opaque(seed: int) -> mi.UInt32:
+    """A seed that is data to the kernels, so that a new one compiles nothing."""
+    return dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+
+
+def _join(picture: list[mi.Float]) -> mi.Float:
+    """One flat array, channel after channel."""
+    return dr.concat(picture)

@@ -1,0 +1,109 @@
+"""The edges of a welded triangle mesh, each with the one or two faces beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NO_FACE = np.iinfo(np.uint32).max
+
+
+@dataclass(frozen=True)
+class MeshEdges:
+    """E edges. Corner c of face f is numbered 3 f + c; half-edge c runs from corner c to the next one of its face."""
+
+    half_a: np.ndarray
+    """(E,) int64 half-edge of one face."""
+    half_b: np.ndarray
+    """(E,) int64 half-edge of the other face, -1 at a boundary edge."""
+
+    @property
+    def face_a(self) -> np.ndarray:
+        """(E,) uint32."""
+        return (self.half_a // 3).astype(np.uint32)
+
+    @property
+    def face_b(self) -> np.ndarray:
+        """(E,) uint32, `NO_FACE` at a boundary edge."""
+        return np.where(self.half_b < 0, NO_FACE, self.half_b // 3).astype(np.uint32)
+
+
+def corners(faces: np.ndarray, half_edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertex indices of half-edges: where each starts, where it ends, and the face's third vertex."""
+    face, corner = np.divmod(half_edges, 3)
+    return faces[face, corner], faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
+
+
+def pair_half_edges(faces: np.ndarray, half_edges: np.ndarray | None = None) -> MeshEdges:
+    """Joins half-edges that lie between the same two vertices.
+
+    Where more than two faces meet in an edge they are paired in the order of the face list; an odd one is a boundary.
+
+    Args:
+        faces: (F, 3) int64 vertex indices.
+        half_edges: the half-edges to pair; None is all of them.
+    """
+    count = 3 * len(faces)
+    if half_edges is None:
+        half_edges = np.arange(count, dtype=np.int64)
+        start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    else:
+        start, end, _ = corners(faces, half_edges)
+    if not len(half_edges):
+        return MeshEdges(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    vertex_count = int(faces.max()) + 1
+    low_bits = max(count - 1, 1).bit_length()
+    edge = np.minimum(start, end).astype(np.int64) * vertex_count + np.maximum(start, end)
+    if (vertex_count * vertex_count).bit_length() + low_bits <= 63:
+        # Edge and half-edge in one number: a plain sort is several times faster than an argsort.
+        packed = np.sort((edge << low_bits) | half_edges)
+        edge, half_edges = packed >> low_bits, packed & ((1 << low_bits) - 1)
+    else:
+        order = np.argsort(edge, kind="stable")
+        edge, half_edges = edge[order], half_edges[order]
+    joined = np.append(edge[1:] == edge[:-1], False)  # this one and the next
+    begins = np.flatnonzero(np.append(True, ~joined[:-1]))
+    place = np.arange(len(edge)) - np.repeat(begins, np.diff(np.append(begins, len(edge))))
+    first = np.flatnonzero(place % 2 == 0)
+    following = half_edges[np.minimum(first + 1, len(edge) - 1)]
+    return MeshEdges(half_edges[first], np.where(joined[first], following, -1))
+
+
+class EdgeCache:
+    """Edges of a mesh whose first faces stay the same: only the rest is paired anew."""
+
+    def __init__(self) -> None:
+        self._fixed_faces: np.ndarray | None = None
+        self._fixed = MeshEdges(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        self._open = np.zeros(0, np.int64)
+
+    def edges(self, faces: np.ndarray, static_faces: int = 0) -> tuple[MeshEdges, MeshEdges]:
+        """The edges between static faces (the same object as long as those faces are the same), and all other edges."""
+        fixed_faces = faces[:static_faces]
+        if self._fixed_faces is None or not np.array_equal(self._fixed_faces, fixed_faces):
+            self._fixed_faces = fixed_faces.copy()
+            pairs = pair_half_edges(fixed_faces)
+            closed = pairs.half_b >= 0
+            self._fixed = MeshEdges(pairs.half_a[closed], pairs.half_b[closed])
+            self._open = pairs.half_a[~closed]
+        if not static_faces:
+            return self._fixed, pair_half_edges(faces)
+        moving = np.arange(3 * static_faces, 3 * len(faces), dtype=np.int64)
+        return self._fixed, pair_half_edges(faces, np.concatenate([self._open, moving]))
+
+
+def check_welded(faces: np.ndarray, edges: MeshEdges) -> None:
+    """Refuses meshes whose silhouette gradients would silently be wrong.
+
+    Raises:
+        ValueError: most edges have one face only (vertices not welded), or neighbours disagree about the outside.
+    """
+    closed = edges.half_b >= 0
+    if len(faces) >= 100 and closed.mean() < 0.5:
+        raise ValueError(f"{int((~closed).sum())} of {len(closed)} edges have one face only: weld the mesh's vertices")
+    starts = faces.reshape(-1)
+    start_a, start_b = starts[edges.half_a[closed]], starts[edges.half_b[closed]]
+    against = int((start_a == start_b).sum())
+    if against > 0.01 * len(start_a):
+        raise ValueError(f"{against} of {len(start_a)} edges join faces of opposite winding: orient the mesh")

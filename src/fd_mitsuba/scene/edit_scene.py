@@ -1,0 +1,280 @@
+"""What to edit, read from a Mitsuba scene: the base's triangles, the focal regions, the prompts."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fd_mitsuba.conventions import BASE_NAME, DEFAULT_PART_NAME, GRID_HALF_EXTENT
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
+from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION, region_triangles
+from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
+
+LEAST_SHARE_IN_GRID = 0.5
+"""A region with less of its volume than this in the grid cube is an error; a smaller overhang is a warning."""
+
+_PART_NAME = re.compile(r"\w[\w.-]{0,63}")
+
+
+@dataclass(frozen=True)
+class EditScene:
+    """A scene to edit; frozen, with nothing of Mitsuba in it.
+
+    Attributes:
+        path: the scene file.
+        parameters: the `-D` values that it was read with.
+        prompt: what the edited object shall look like; never blank.
+        base_prompt: what the base looks like, "" if not given.
+        negative_prompt: what to keep away from, "" if not given.
+        base: the base's meshes in the user frame, after their `to_world`.
+        regions: the focal regions, in the canonical frame.
+        frame: the map between the two frames.
+        files: every file that the scene reads, the scene file and its includes first.
+        has_light: whether the scene has an emitter of any kind.
+        has_part_bsdf: whether it has a top-level BSDF with the id "part".
+    """
+
+    path: Path
+    prompt: str
+    base: tuple[TriangleMesh, ...]
+    regions: tuple[FocalRegion, ...]
+    frame: Normalisation
+    base_prompt: str = ""
+    negative_prompt: str = ""
+    parameters: dict[str, str] = field(default_factory=dict)
+    files: tuple[Path, ...] = ()
+    has_light: bool = False
+    has_part_bsdf: bool = False
+
+    @property
+    def parts(self) -> dict[str, tuple[FocalRegion, ...]]:
+        """Part name -> its regions, in the order of the scene file."""
+        names = dict.fromkeys(region.part for region in self.regions)
+        return {name: tuple(region for region in self.regions if region.part == name) for name in names}
+
+    @cached_property
+    def base_soup(self) -> TriangleMesh:
+        """All base meshes as one, user frame, vertices not welded: for distances, not for export."""
+        return _soup(self.base)
+
+    @cached_property
+    def base_canonical(self) -> TriangleMesh:
+        """`base_soup` in the canonical frame."""
+        soup = self.base_soup
+        return TriangleMesh(BASE_NAME, self.frame.to_canonical(soup.vertices), soup.faces, soup.source_files)
+
+    def mitsuba_scene(self, without: tuple[str, ...] = ()) -> Any:
+        """The scene file as an `mi.Scene` in the user frame; see `SceneFile.instantiate`."""
+        return SceneFile(self.path, self.parameters).instantiate(without)
+
+
+def load_edit_scene(path: Path | str, parameters: dict[str, str] | None = None) -> EditScene:
+    """Read a scene file, check it, and load it once in Mitsuba so that later loading cannot fail.
+
+    Args:
+        path: the XML file.
+        parameters: values for `$name`, as given with `-D name=value`.
+
+    Raises:
+        UserError: any input that cannot be edited, in one line with file, element and remedy.
+    """
+    file = SceneFile(path, parameters)
+    prompts = _prompts(file)
+    base = tuple(_base_mesh(file, element) for element in file.top_level("shape") if element.plugin != FOCAL_REGION)
+    if not base:
+        raise UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
+    frame = _frame(file, base)
+    elements = [element for element in file.top_level("shape") if element.plugin == FOCAL_REGION]
+    if not elements:
+        raise UserError(f'{file.path}: no focal region; add <shape type="focal_region" id="..."> where to edit')
+    regions = tuple(_region(file, element, index, frame) for index, element in enumerate(elements))
+    soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
+    distance = MeshDistance(soup.vertices, soup.faces)
+    for element, region in zip(elements, regions, strict=True):
+        gap = gap_to_base(region, distance, soup)
+        if gap > region.size:
+            away = f"the region is {gap / frame.scale:.3g} away from the base, more than its own size"
+            raise element.error(f"{away}; move it closer")
+    file.instantiate()
+    files = tuple(dict.fromkeys([*file.text.files, *file.files.values()]))
+    return EditScene(
+        path=file.path,
+        prompt=prompts[0],
+        base=base,
+        regions=regions,
+        frame=frame,
+        base_prompt=prompts[1],
+        negative_prompt=prompts[2],
+        parameters=file.parameters,
+        files=files,
+        has_light=any(element.kind == "emitter" for element in file.elements),
+        has_part_bsdf=any(element.id == DEFAULT_PART_NAME for element in file.top_level("bsdf")),
+    )
+
+
+def _soup(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    sources = tuple(dict.fromkeys(source for mesh in meshes for source in mesh.source_files))
+    return TriangleMesh(BASE_NAME, np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), sources)
+
+
+def _prompts(file: SceneFile) -> tuple[str, str, str]:
+    integrators = [element for element in file.top_level("integrator") if element.plugin == DUAL_PATH]
+    if not integrators:
+        raise UserError(f'{file.path}: no <integrator type="{DUAL_PATH}">; add it with <string name="prompt" .../>')
+    if len(integrators) > 1:
+        raise integrators[1].error("there are several; keep one")
+    values = []
+    for name in ("prompt", "base_prompt", "negative_prompt"):
+        value = integrators[0].properties.get(name, "")
+        if not isinstance(value, str):
+            raise integrators[0].error(f'{name} is not text; write <string name="{name}" value="..."/>')
+        values.append(" ".join(value.split()))
+    if not values[0]:
+        raise integrators[0].error('prompt is missing or blank; add <string name="prompt" value="a horse with wings"/>')
+    return values[0], values[1], values[2]
+
+
+def _to_world(element: SceneElement) -> np.ndarray:
+    transform = element.properties.get("to_world")
+    matrix = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+        raise element.error("to_world holds NaN or infinity; correct its numbers")
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
+        raise element.error("to_world is not affine (its last row is not 0 0 0 1); correct its matrix")
+    stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if stretch[-1] <= 1e-9 * stretch[0]:
+        raise element.error("to_world is singular (it flattens the shape); use scales other than 0")
+    return matrix
+
+
+def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> tuple[np.ndarray, np.ndarray]:
+    to_world = _to_world(element)
+    plain = {name: value for name, value in element.properties.items() if name != "to_world"}
+    subject = f"{filename}: " if filename else ""
+    try:
+        with file.searching():
+            if element.plugin == FOCAL_REGION:
+                return region_triangles(file.mi, filename, to_world)
+            return shape_triangles(file.mi, element.plugin, plain, to_world)
+    except NotAMesh:
+        raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None
+    except BrokenMesh as error:
+        raise element.error(f"{subject}{error}; repair the mesh and save it anew") from None
+    except ValueError as error:
+        raise element.error(f"{error}; save it as one of these") from None
+    except RuntimeError as error:
+        problem = str(file.translated(error)).removeprefix(f"{file.path}: ")
+        raise element.error(f"{subject}{problem}") from None
+
+
+def _base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:
+    filename = element.properties.get("filename")
+    vertices, faces = _triangles(file, element, filename)
+    sources = (file.resolve(filename),) if filename else ()
+    return TriangleMesh(element.id or BASE_NAME, vertices, faces, sources)
+
+
+def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
+    soup = _soup(base)
+    names = ", ".join(mesh.name for mesh in base)
+    used = soup.vertices[np.unique(soup.faces)]
+    try:
+        frame = Normalisation.of_points(used)
+    except ValueError:
+        raise UserError(
+            f"{file.path}: base {names}: all its vertices are at one point; give a mesh with a size"
+        ) from None
+    if not _encloses_volume(TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)):
+        count = len(soup.faces)
+        raise UserError(
+            f"{file.path}: base {names}: its {count} faces enclose no volume; give a solid object, closed or nearly so"
+        )
+    return frame
+
+
+def _encloses_volume(mesh: TriangleMesh) -> bool:
+    """Whether behind at least 1 % of the area the winding number says inside: a sheet has no more than 1/2 there."""
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    if not length.sum() > 0:
+        return False
+    random = np.random.default_rng(0)
+    chosen = random.choice(len(length), size=2000, p=length / length.sum())
+    weights = random.dirichlet([1.0, 1.0, 1.0], size=2000)
+    points = np.einsum("ij,ijk->ik", weights, corners[chosen])
+    behind = 2e-3 * normal[chosen] / length[chosen, None]
+    distance = MeshDistance(mesh.vertices, mesh.faces)
+    number = np.maximum(
+        np.abs(distance.winding_number(points - behind)), np.abs(distance.winding_number(points + behind))
+    )
+    return bool(np.mean(number > 0.55) >= 0.01)
+
+
+def _region(file: SceneFile, element: SceneElement, index: int, frame: Normalisation) -> FocalRegion:
+    to_world = _to_world(element)
+    name = element.id or f"region_{index + 1}"
+    part = element.properties.get("part", DEFAULT_PART_NAME)
+    if not isinstance(part, str) or not _PART_NAME.fullmatch(part) or part.endswith(".") or part == BASE_NAME:
+        raise element.error(
+            f"part {part!r} cannot name a file; use letters, digits, '_' and '-', and not {BASE_NAME!r}"
+        )
+    mesh = None
+    filename = element.properties.get("filename")
+    if filename:
+        vertices, faces = _triangles(file, element, filename)
+        if not topology(vertices, faces).closed:
+            raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
+        mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, (file.resolve(filename),))
+    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh)
+    if not region.volume > 0:
+        raise element.error("the region has no volume; enlarge it")
+    inside = share_in_grid(region)
+    if inside < LEAST_SHARE_IN_GRID:
+        low, high = frame.to_user(np.full(3, -GRID_HALF_EXTENT)), frame.to_user(np.full(3, GRID_HALF_EXTENT))
+        box = f"{_short(low)} to {_short(high)}"
+        raise element.error(f"{inside:.0%} of the region lies in the editable cube {box}; move or shrink it")
+    return region
+
+
+def share_in_grid(region: FocalRegion, samples: int = 24) -> float:
+    """Share of the region's volume within the grid cube [-1.05, 1.05]^3, sampled on a lattice over its bounds."""
+    low, high = region.bounds
+    steps = (np.arange(samples) + 0.5) / samples
+    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = low + lattice * (high - low)
+    points = points[region.sdf(points) > 0]
+    if not len(points):
+        points = region.surface(2).vertices
+    return float(np.mean(np.all(np.abs(points) <= GRID_HALF_EXTENT, axis=1)))
+
+
+def gap_to_base(region: FocalRegion, distance: MeshDistance, base: TriangleMesh) -> float:
+    """Distance between the region and the base in canonical units; 0 where they overlap or one contains the other.
+
+    Args:
+        distance: of the base in the canonical frame.
+        base: the same base in the canonical frame; its vertices are tested against the region too.
+    """
+    surface = region.surface(3).vertices
+    if distance.inside(surface).any():
+        return 0.0
+    to_surface = float(distance.unsigned(surface).min())
+    to_vertices = float(-region.sdf(base.vertices).max())
+    return max(min(to_surface, to_vertices), 0.0)
+
+
+def _short(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in point) + ")"

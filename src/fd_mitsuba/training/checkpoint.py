@@ -1,0 +1,134 @@
+"""Checkpoints that a kill cannot spoil: one safetensors file a step, written aside and renamed.
+
+A file holds the field, the optimiser's moments, and in its header the stage, the step, the settings' hash and the format
+version. Random numbers depend on (seed, step) only, so no generator state is needed for a resumed run to go on exactly.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from fd_mitsuba.errors import UserError
+
+FORMAT = 1
+_HEADER_KEY = "fd_mitsuba"
+
+
+@dataclass(frozen=True)
+class CheckpointHeader:
+    """`step` counts the finished steps; `config_hash` is `RunConfig.content_hash`."""
+
+    stage: str
+    step: int
+    config_hash: str
+    format: int = FORMAT
+
+
+def checkpoint_path(folder: Path, step: int) -> Path:
+    """Where the checkpoint after `step` finished steps lies."""
+    return folder / f"step_{step:06d}.safetensors"
+
+
+def save_checkpoint(
+    folder: Path, header: CheckpointHeader, field: nn.Module, optimiser: torch.optim.Optimizer, keep: int
+) -> Path:
+    """Write a checkpoint so that it is there whole or not at all, then remove all but the newest `keep`.
+
+    Raises:
+        UserError: the folder cannot be written (full, read-only).
+    """
+    tensors = {f"field.{name}": value.detach().contiguous() for name, value in field.state_dict().items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        for name, value in state.items():
+            tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value).contiguous()
+    data = save(tensors, metadata={_HEADER_KEY: json.dumps(vars(header), sort_keys=True)})
+    path = checkpoint_path(folder, header.step)
+    write_atomically(path, data)
+    for old in list_checkpoints(folder)[:-keep]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write bytes to a neighbouring file, flush it to the disk, rename it; UserError if the folder cannot be written."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UserError(f"{path}: cannot be written ({error.strerror}); free space or choose another -o folder") from None
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """Checkpoint files, oldest first; strays are ignored."""
+    found = [p for p in folder.glob("step_*.safetensors") if p.stem[5:].isdigit()]
+    return sorted(found, key=lambda p: int(p.stem[5:]))
+
+
+def load_newest(
+    folder: Path, stage: str, config_hash: str, field: nn.Module, optimiser: torch.optim.Optimizer
+) -> tuple[int, list[str]]:
+    """Load the newest whole checkpoint into the field and the optimiser.
+
+    Returns:
+        The number of finished steps (0 without a checkpoint), and a line for each damaged file that was passed over.
+
+    Raises:
+        UserError: the checkpoint is of other settings, another stage, format or shape.
+    """
+    remarks: list[str] = []
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            with safe_open(path, framework="pt") as file:
+                header = json.loads((file.metadata() or {}).get(_HEADER_KEY, "null"))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}
+        except (SafetensorError, OSError, ValueError) as error:
+            remarks.append(f"{path}: damaged checkpoint passed over ({error})")
+            continue
+        _check_header(path, header, stage, config_hash)
+        _apply(path, tensors, field, optimiser)
+        return int(header["step"]), remarks
+    return 0, remarks
+
+
+def _check_header(path: Path, header: dict | None, stage: str, config_hash: str) -> None:
+    if not header:
+        raise UserError(f"{path}: not a checkpoint of fd_mitsuba (no header); remove it or choose another -o folder")
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path}: checkpoint format {header.get('format')}, this version reads {FORMAT}; start anew")
+    if header.get("stage") != stage:
+        raise UserError(f"{path}: checkpoint of stage {header.get('stage')!r}, not {stage!r}; choose another -o folder")
+    if header.get("config_hash") != config_hash:
+        raise UserError(f"{path}: made with other settings; resume with the run's own -c, --set and -D, or choose another -o")
+
+
+def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: torch.optim.Optimizer) -> None:
+    own = field.state_dict()
+    stored = {name[6:]: value for name, value in tensors.items() if name.startswith("field.")}
+    if {n: v.shape for n, v in own.items()} != {n: v.shape for n, v in stored.items()}:
+        raise UserError(f"{path}: its tensors do not fit this field; choose another -o folder")
+    bad = [name for name, value in tensors.items() if value.is_floating_point() and not torch.isfinite(value).all()]
+    if bad:
+        raise UserError(f"{path}: {bad[0]} holds values that are not finite; remove this file to resume from an earlier one")
+    field.load_state_dict(stored)
+    state = optimiser.state_dict()
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimiser."):
+            _, index, key = name.split(".", 2)
+            moments.setdefault(int(index), {})[key] = value
+    state["state"] = moments
+    optimiser.load_state_dict(state)

@@ -1,0 +1,280 @@
+"""One step of the geometry stage: field -> surface -> pictures -> guidance and losses -> optimiser.
+
+L_geo = lambda_sds L_SDS + lambda_focal L_GF + lambda_collision L_CA (paper, supplement "Geometry Learning"), and an
+optional price on the part's volume. A weight of 0 turns its work off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import RunStopped
+from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface, active_vertices
+from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.fields.base_shape import base_sdf
+from fd_mitsuba.fields.part_sdf import PartField
+from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
+from fd_mitsuba.losses.collision import loss_collision
+from fd_mitsuba.losses.focal import loss_focal
+from fd_mitsuba.render.geometry_pass import GeometryPass
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import union_sdf
+from fd_mitsuba.scene.views import CameraBatch, sample_views
+from fd_mitsuba.training.seeds import Purpose, seed_for
+
+VANISHED_AFTER = 25
+"""Steps in a row without any visible part before the run is stopped."""
+EXPLODED_BEYOND = 1.0
+"""A signed distance further than this from where it started, canonical units, is no shape any more."""
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What one step reports.
+
+    Attributes:
+        values: numbers for the metrics file and the progress line.
+        pictures: the step's geometry pictures (B, 5, H, W), without gradients.
+        preview: the guidance's estimate of clean latents, or None.
+    """
+
+    values: dict[str, float]
+    pictures: Tensor
+    preview: Tensor | None
+
+
+class GeometryStage:
+    """Everything that the geometry stage holds between steps; its random numbers depend on (seed, step) only.
+
+    Args:
+        scene: what to edit.
+        config: how.
+        guidance: the source of the image loss; its prompt must be set. None leaves the image loss out.
+    """
+
+    def __init__(self, scene: EditScene, config: RunConfig, guidance: Guidance | None) -> None:
+        geometry = config.geometry
+        self.scene, self.config, self.guidance = scene, config, guidance
+        self.grid = TetGrid(geometry.grid_resolution)
+        points = self.grid.vertices.numpy()
+        base = scene.base_canonical
+        self.sdf_base = torch.from_numpy(base_sdf(points, base.vertices, base.faces))
+        self.region_sdf = torch.from_numpy(union_sdf(scene.regions, points).astype(np.float32))
+        self.active = active_vertices(self.grid, self.region_sdf)
+        self.extractor = self._extractor(self.active)
+        self.base_surface = self._base_surface()
+        self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
+        self.optimiser = torch.optim.AdamW(
+            self.field.parameters(),
+            lr=geometry.learning_rate,
+            betas=geometry.betas,
+            eps=geometry.eps,
+            weight_decay=geometry.weight_decay,
+        )
+        self.focus = _bounding_ball(points[(self.region_sdf > 0).numpy()])
+        self.aim = _centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
+        self._passes: dict[Phase, GeometryPass] = {}
+        self._base_passes: dict[Phase, GeometryPass] = {}
+        self._invisible = 0
+
+    @property
+    def coarse_steps(self) -> int:
+        """How many steps the coarse phase has."""
+        return round(self.config.geometry.steps * self.config.geometry.coarse_fraction)
+
+    def phase_of(self, step: int) -> tuple[Phase, int, int]:
+        """The phase of a step, its place in the phase, and the phase's length."""
+        coarse = self.coarse_steps
+        if step < coarse:
+            return "coarse", step, coarse
+        return "refined", step - coarse, self.config.geometry.steps - coarse
+
+    def cameras(self, step: int) -> tuple[CameraBatch, bool]:
+        """The step's views, and whether they are close-ups of the focal regions."""
+        settings, seed = self.config.cameras, seed_for(self.config.seed, Purpose.VIEWS, step)
+        closeup = bool(np.random.default_rng((seed, 1)).random() < settings.focus_fraction)
+        together = self.guidance.view_grid**2 if self.guidance is not None else 1
+        views = sample_views(
+            settings,
+            self.config.geometry.views,
+            seed,
+            focus=self.focus if closeup else None,
+            centre=self.aim if settings.aim == "object" else None,
+            together=together,
+        )
+        return views, closeup
+
+    def surface(self) -> UnionSurface:
+        """The union's surface for the present parameters, with gradients."""
+        return self.extractor(self.field)
+
+    def start_surface(self) -> UnionSurface:
+        """The union's surface with the focal regions themselves as the part, without gradients."""
+        with torch.no_grad():
+            return self.extractor(PartField(self.config.field.model_copy(update={"offsets": False})))
+
+    def part_solid(self, name: str | None) -> tuple[Tensor, Tensor]:
+        """The part's closed solid, vertices (V, 3) and faces (F, 3), canonical, without gradients.
+
+        Args:
+            name: a named part: what of the solid is nearer to its regions than to those of the others; None: all.
+        """
+        label = None
+        if name is not None and len(self.scene.parts) > 1:
+            points = self.grid.vertices.numpy()
+            others = [region for other, regions in self.scene.parts.items() if other != name for region in regions]
+            own = union_sdf(self.scene.parts[name], points)
+            label = torch.from_numpy(((own - union_sdf(others, points)) / 2).astype(np.float32))
+        return self.extractor.extract_part(self.field, label)
+
+    def step(self, step: int) -> StepRecord:
+        """Run step `step` (counted from 0 over both phases) and change the field once.
+
+        Raises:
+            RunStopped: a value that is not finite, a field that explodes, a part that stays invisible.
+        """
+        geometry = self.config.geometry
+        phase, phase_step, phase_length = self.phase_of(step)
+        cameras, closeup = self.cameras(step)
+        samples = self._samples(step)
+        surface = self.extractor(self.field, samples)
+        losses: dict[str, Tensor] = {}
+        values: dict[str, float] = {}
+        pictures, preview = torch.zeros(0), None
+        if self.guidance is not None and geometry.lambda_sds > 0:
+            pictures = self._render(surface, cameras, phase, step)
+            base = self._render_base(cameras, phase, step) if self.guidance.needs_base else None
+            views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup)
+            seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
+            result = self.guidance.guide(views, phase_step, phase_length, phase, seed)
+            losses["sds"], preview = result.loss, result.preview
+            values.update(result.logs)
+            self._watch_visibility(pictures)
+        if samples is not None:
+            losses.update(self._sample_losses(surface.sample_sdf, samples))
+        total = sum(getattr(geometry, f"lambda_{name}") * loss for name, loss in losses.items())
+        values.update({f"loss_{name}": float(loss.detach()) for name, loss in losses.items()})
+        values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
+        if not np.isfinite(values["loss"]):
+            raise RunStopped(f"step {step}: the loss is not finite; lower geometry.learning_rate or guidance.guidance_scale")
+        if isinstance(total, Tensor) and total.requires_grad:
+            self.optimiser.zero_grad(set_to_none=True)
+            total.backward()
+            self._check_gradients(step)
+            self.optimiser.step()
+        values["part_faces"] = float(surface.face_is_part.sum())
+        return StepRecord(values, pictures.detach(), preview)
+
+    def check_field(self, step: int) -> dict[str, float]:
+        """The part's share of the focal regions' volume; raises RunStopped for a field that is not finite or exploded."""
+        sdf = self.extractor.part_sdf(self.field)
+        start = self.region_sdf[self.extractor.active_index]
+        if not torch.isfinite(sdf).all():
+            raise RunStopped(f"step {step}: the part's field is not finite; lower geometry.learning_rate")
+        if float((sdf - start).abs().max()) > EXPLODED_BEYOND:
+            raise RunStopped(
+                f"step {step}: the part's field exploded (it is {float((sdf - start).abs().max()):.2f} away from its start); "
+                "lower geometry.learning_rate or geometry.lambda_sds"
+            )
+        inside = float((sdf > 0).sum()) / max(float((start > 0).sum()), 1.0)
+        if inside == 0.0:
+            raise RunStopped(f"step {step}: the part vanished; lower geometry.lambda_volume or guidance.guidance_scale")
+        return {"volume_ratio": inside}
+
+    def _sample_losses(self, sdf_part: Tensor, samples: Tensor) -> dict[str, Tensor]:
+        geometry, losses = self.config.geometry, {}
+        region = self.region_sdf[samples]
+        if geometry.lambda_focal > 0:
+            outside = region < 0
+            distance = (-region[outside] - geometry.focal_band).clamp(min=0)
+            losses["focal"] = loss_focal(
+                sdf_part[outside],
+                distance,
+                geometry.focal_sigma_distance,
+                geometry.focal_sigma_sdf,
+                geometry.focal_margin,
+            )
+        if geometry.lambda_collision > 0:
+            losses["collision"] = loss_collision(self.sdf_base[samples], sdf_part)
+        if geometry.lambda_volume > 0:
+            losses["volume"] = (0.5 + sdf_part / (2 * self.grid.spacing)).clamp(0, 1).mean()
+        return losses
+
+    def _samples(self, step: int) -> Tensor | None:
+        geometry = self.config.geometry
+        if geometry.lambda_focal == geometry.lambda_collision == geometry.lambda_volume == 0:
+            return None
+        index = self.extractor.active_index
+        if len(index) <= geometry.focal_samples:
+            return index
+        generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.SAMPLES, step))
+        return index[torch.randint(len(index), (geometry.focal_samples,), generator=generator)]
+
+    def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
+        return self._pass(self._passes, phase).render(
+            surface.vertices,
+            surface.faces,
+            surface.part_weight,
+            cameras,
+            seed_for(self.config.seed, Purpose.PIXELS, step),
+            static_faces=self.extractor.static_faces,
+        )
+
+    def _render_base(self, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
+        base = self.base_surface
+        return self._pass(self._base_passes, phase).render_primal(
+            base.vertices,
+            base.faces,
+            base.part_weight,
+            cameras,
+            seed_for(self.config.seed, Purpose.BASE_PIXELS, step),
+            static_faces=len(base.faces),
+        )
+
+    def _pass(self, passes: dict[Phase, GeometryPass], phase: Phase) -> GeometryPass:
+        if phase not in passes:
+            geometry = self.config.geometry
+            size = self.guidance.picture_size(phase) if self.guidance is not None else 64
+            # A picture of the refined phase is averaged down by the encoder: one sample a pixel is plenty.
+            spp = geometry.spp if phase == "coarse" else 1
+            passes.clear()
+            passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
+        return passes[phase]
+
+    def _extractor(self, active: Tensor) -> SurfaceExtractor:
+        geometry = self.config.geometry
+        return SurfaceExtractor(
+            self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside
+        )
+
+    def _base_surface(self) -> UnionSurface:
+        with torch.no_grad():
+            alone = self._extractor(torch.zeros(0, dtype=torch.int64))
+            return alone(PartField(self.config.field))
+
+    def _watch_visibility(self, pictures: Tensor) -> None:
+        self._invisible = self._invisible + 1 if float(pictures[:, 4].detach().sum()) < 0.5 else 0
+        if self._invisible >= VANISHED_AFTER:
+            raise RunStopped(
+                f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
+                "or lower geometry.lambda_volume"
+            )
+
+    def _check_gradients(self, step: int) -> None:
+        for parameter in self.field.parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                raise RunStopped(f"step {step}: a gradient is not finite; lower geometry.learning_rate")
+
+
+def _bounding_ball(points: np.ndarray) -> tuple[np.ndarray, float]:
+    centre = _centre_of_box(points)
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def _centre_of_box(points: np.ndarray) -> np.ndarray:
+    return (points.min(axis=0) + points.max(axis=0)) / 2

@@ -1,0 +1,90 @@
+"""The loop of a stage: step, record, checkpoint; stops cleanly on a signal and keeps the last good state on a failure."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from fd_mitsuba.errors import Interrupted
+from fd_mitsuba.training.checkpoint import CheckpointHeader, load_newest, save_checkpoint
+from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.record import Recorder
+
+STAGE = "geometry"
+_FIELD_CHECKED_EVERY = 10
+
+
+class _StopRequest:
+    """Set by SIGINT or SIGTERM; a second signal is left to Python."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.name = signal.Signals(number).name
+        signal.signal(number, signal.SIG_DFL)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[_StopRequest]:
+    """While open, SIGINT and SIGTERM are noted instead of ending the process."""
+    request = _StopRequest()
+    old = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def run_geometry(
+    stage: GeometryStage,
+    folder: Path,
+    resume: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Train until the last step; the newest checkpoint in `folder/checkpoints` then holds the result.
+
+    Args:
+        stage: fresh; a checkpoint is loaded into it if `resume`.
+        folder: the run folder.
+        say: takes remarks for the user, a line each.
+
+    Raises:
+        Interrupted: after SIGINT or SIGTERM, with a checkpoint of the last finished step.
+        RunStopped: the run cannot go on; the checkpoints stay as they were.
+        UserError: a checkpoint that does not fit, a folder that cannot be written.
+    """
+    config, checkpoints = stage.config, folder / "checkpoints"
+    config_hash, total = config.content_hash(), config.geometry.steps
+    done = 0
+    if resume:
+        done, remarks = load_newest(checkpoints, STAGE, config_hash, stage.field, stage.optimiser)
+        for remark in remarks:
+            say(remark)
+        say(f"resuming after step {done} of {total}" if done else "no checkpoint yet: starting at step 0")
+
+    def save(step: int) -> None:
+        header = CheckpointHeader(STAGE, step, config_hash)
+        save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept)
+
+    with stop_on_signals() as request, Recorder(folder, STAGE, total, done, quiet) as recorder:
+        for step in range(done, total):
+            record = stage.step(step)
+            finished = step + 1
+            last = finished == total
+            values = dict(record.values)
+            if finished % _FIELD_CHECKED_EVERY == 0 or last or finished % config.output.checkpoint_every == 0:
+                values.update(stage.check_field(finished))
+            recorder.row(finished, stage.phase_of(step)[0], values)
+            every = config.output.sheet_every
+            if len(record.pictures) and every and (finished % every == 0 or last):
+                recorder.sheet(finished, record)
+            if finished % config.output.checkpoint_every == 0 or last or request.name:
+                save(finished)
+            if request.name and not last:
+                raise Interrupted(f"{request.name}: stopped after step {finished} of {total}; continue with --resume")

@@ -1,0 +1,123 @@
+"""What a run tells while it goes on: a progress line, `metrics.jsonl`, and contact sheets."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+import torch
+from PIL import Image
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from fd_mitsuba.training.geometry_stage import StepRecord
+
+_SHOWN = ("loss_sds", "loss_focal", "loss_collision", "volume_ratio")
+_PLAIN_EVERY_SECONDS = 15.0
+
+
+def read_metrics(path: Path) -> list[dict]:
+    """The rows of a metrics file; a last line that a kill cut short is dropped."""
+    rows = []
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                rows.append(json.loads(line))
+            except json.JSONDecodeError:
+                break
+    return rows
+
+
+class Recorder:
+    """Context manager that owns the metrics file and the progress display of one stage.
+
+    Args:
+        folder: the run folder.
+        stage: its name in every row.
+        total: steps of the stage.
+        done: steps that are finished already; later rows of an interrupted run are cut from the metrics file.
+        quiet: no progress display.
+    """
+
+    def __init__(self, folder: Path, stage: str, total: int, done: int = 0, quiet: bool = False) -> None:
+        self._path, self._stage, self._total, self._done = folder / "metrics.jsonl", stage, total, done
+        self._images = folder / "images"
+        self._console = Console(stderr=True)
+        self._live = self._console.is_terminal and not quiet
+        self._quiet = quiet
+        self._progress: Progress | None = None
+        self._file: IO[str] | None = None
+        self._started = self._spoken = time.monotonic()
+
+    def __enter__(self) -> Recorder:
+        kept = [row for row in read_metrics(self._path) if row.get("step", 0) <= self._done or row["stage"] != self._stage]
+        self._images.mkdir(parents=True, exist_ok=True)
+        self._file = open(self._path, "w", encoding="utf-8")  # noqa: SIM115 - closed in __exit__
+        self._file.writelines(json.dumps(row) + "\n" for row in kept)
+        self._file.flush()
+        if self._live:
+            self._progress = Progress(
+                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),
+                TimeRemainingColumn(), TextColumn("{task.fields[values]}"), console=self._console,
+            )
+            self._progress.start()
+            self._task = self._progress.add_task(self._stage, total=self._total, completed=self._done, values="")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+        if self._file is not None:
+            self._file.close()
+
+    def row(self, step: int, phase: str, values: dict[str, float]) -> None:
+        """Append one row to `metrics.jsonl` (`step` counts finished steps) and move the display on."""
+        row = {"stage": self._stage, "phase": phase, "step": step, "seconds": round(time.monotonic() - self._started, 3)}
+        assert self._file is not None
+        self._file.write(json.dumps({**row, **{name: _short(value) for name, value in values.items()}}) + "\n")
+        self._file.flush()
+        shown = "  ".join(f"{name.removeprefix('loss_')} {values[name]:.3g}" for name in _SHOWN if name in values)
+        if self._progress is not None:
+            self._progress.update(self._task, completed=step, description=phase, values=shown)
+        elif not self._quiet and (time.monotonic() - self._spoken > _PLAIN_EVERY_SECONDS or step == self._total):
+            self._spoken = time.monotonic()
+            rate = (self._spoken - self._started) / max(step - self._done, 1)
+            self._console.print(
+                f"{phase} {step}/{self._total}  {rate:.2f} s/step  ETA {rate * (self._total - step):.0f} s  {shown}",
+                highlight=False,
+            )
+
+    def sheet(self, step: int, record: StepRecord) -> Path:
+        """Write the step's views as `images/step_NNNNNN.png`: normals, part mask, and the guidance's estimate below."""
+        rows = [np.concatenate(list(normal_pictures(record.pictures)), axis=1)]
+        mask = record.pictures[:, 4].clamp(0, 1).numpy()
+        rows.append(np.repeat(np.concatenate(list((mask * 255).astype(np.uint8)), axis=1)[..., None], 3, axis=2))
+        sheet = np.concatenate(rows, axis=0)
+        if record.preview is not None:
+            # Latents are read as (normal, 2 mask - 1), which is what they are for the built-in prior.
+            latents = record.preview.float().cpu()
+            guess = torch.cat([latents[:, :3], (latents[:, 3:4] + 1) / 2], dim=1)
+            strip = np.concatenate(list(normal_pictures(guess)), axis=1)
+            image = Image.fromarray(strip)
+            height = max(1, round(strip.shape[0] * sheet.shape[1] / strip.shape[1]))
+            below = np.asarray(image.resize((sheet.shape[1], height), Image.Resampling.NEAREST))
+            sheet = np.concatenate([sheet, below], axis=0)
+        factor = max(1, round(512 / sheet.shape[1]))
+        path = self._images / f"step_{step:06d}.png"
+        Image.fromarray(sheet).resize((sheet.shape[1] * factor, sheet.shape[0] * factor), Image.Resampling.NEAREST).save(path)
+        return path
+
+
+def normal_pictures(pictures: torch.Tensor) -> np.ndarray:
+    """Colours (B, H, W, 3) uint8 of geometry pictures (B, >=4, H, W): (n + 1) / 2 on covered pixels over black."""
+    normal, mask = pictures[:, :3], pictures[:, 3:4]
+    colour = ((normal + mask) / 2).clamp(0, 1).permute(0, 2, 3, 1)
+    return (colour.numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import BASE, write_ply
+from PIL import Image
+
+from fd_mitsuba.check import check_scene, estimate_cost
+from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.preview import preview_scene, region_colours
+from fd_mitsuba.scene.edit_scene import load_edit_scene
+
+Make = Callable[..., Path]
+
+
+def ball(scale: str, x: float, y: float, z: float, part: str = "part") -> str:
+    return f"""<shape type="focal_region" id="ball"><string name="part" value="{part}"/><transform name="to_world">
+      <scale value="{scale}"/><translate x="{x}" y="{y}" z="{z}"/></transform></shape>"""
+
+
+def warnings(path: Path, config: RunConfig | None = None) -> str:
+    return "\n".join(check_scene(load_edit_scene(path), config or RunConfig()).warnings)
+
+
+def test_a_good_scene_has_no_warnings(make_scene: Make) -> None:
+    report = check_scene(load_edit_scene(make_scene(region=ball("0.15", 0, 0.3, 0))), RunConfig())
+    assert report.warnings == () and report.base_closed
+    (base,), (region,) = report.base, report.regions
+    assert base.topology.closed and base.topology.components == 1 and base.volume > 0
+    assert region.share_in_grid == 1.0 and region.gap_to_base == 0.0 and 0 < region.share_in_base < 0.9
+    cell = 2.1 / 64
+    assert region.thickness_cells == pytest.approx(0.3 * 1.8 / report.longest_side / cell, rel=1e-5)
+    assert region.volume_cells == pytest.approx(np.pi / 6 * region.thickness_cells**3, rel=1e-5)
+
+
+def test_report_as_json_and_lines(make_scene: Make) -> None:
+    report = check_scene(load_edit_scene(make_scene()), RunConfig())
+    data = json.loads(json.dumps(report.to_json()))
+    assert data["base"][0]["topology"]["closed"] is True and data["regions"][0]["name"] == "wing"
+    assert data["cost"]["seconds_total"] > 0
+    assert all(isinstance(line, str) and "\n" not in line for line in report.lines())
+
+
+def test_open_base_and_doubled_faces_are_told(
+    make_scene: Make, tmp_path: Path, animal: tuple[np.ndarray, np.ndarray]
+) -> None:
+    path = make_scene()
+    vertices, faces = animal
+    write_ply(tmp_path / "animal.ply", vertices, faces[5:])
+    assert "not closed" in warnings(path)
+    write_ply(tmp_path / "animal.ply", vertices, np.concatenate([faces, faces[:3]]))
+    assert "3 faces are there twice" in warnings(path)
+    write_ply(tmp_path / "animal.ply", vertices, faces[:, ::-1])
+    assert "point inwards" in warnings(path)
+
+
+@pytest.mark.parametrize(
+    ("region", "words"),
+    [
+        (ball("0.03", 0, 0.3, 0), "cells thin"),
+        (ball("0.1", 0, 0.45, 0), "gap"),
+        (ball("0.1", 0, 0, 0), "inside the base"),
+        (ball("0.25", 0, 0.5, 0), "outside the grid"),
+    ],
+)
+def test_regions_are_judged(make_scene: Make, region: str, words: str) -> None:
+    assert words in warnings(make_scene(region=region))
+
+
+def test_thin_region_names_a_resolution_that_is_enough(make_scene: Make) -> None:
+    path = make_scene(region=ball("0.022", 0, 0.25, 0))
+    words = warnings(path)
+    resolution = int(words.split("grid_resolution=")[1].split()[0])
+    assert "cells thin" not in warnings(path, RunConfig(geometry=GeometryConfig(grid_resolution=resolution)))
+
+
+def test_scene_level_warnings(make_scene: Make) -> None:
+    text = warnings(
+        make_scene(
+            light="", integrator='<integrator type="dual_path"><string name="prompt" value="a pig"/></integrator>'
+        )
+    )
+    assert "no emitter" in text and "base_prompt" in text
+
+
+def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
+    scene = load_edit_scene(make_scene())
+    default = estimate_cost(scene, RunConfig())
+    fine = estimate_cost(scene, RunConfig(geometry=GeometryConfig(grid_resolution=128)))
+    short = estimate_cost(scene, RunConfig(geometry=GeometryConfig(steps=300)))
+    large = estimate_cost(scene, RunConfig(guidance=GuidanceConfig(model="somebody/stable-diffusion")))
+    assert fine.active_vertices == pytest.approx(8 * default.active_vertices, rel=0.1)
+    assert fine.seconds_per_step > default.seconds_per_step
+    assert short.seconds_total == pytest.approx(default.seconds_total / 10)
+    assert large.seconds_per_step > 10 * default.seconds_per_step and large.memory_mb > default.memory_mb + 3000
+
+
+def test_preview_shows_base_and_region(make_scene: Make, tmp_path: Path) -> None:
+    base = BASE.replace('<bsdf type="diffuse"/>', '<bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>')
+    scene = load_edit_scene(make_scene(base=base, region=ball("0.15", 0, 0.35, 0)))
+    (path,) = preview_scene(scene, tmp_path / "out", views=2, size=64)
+    picture = np.asarray(Image.open(path).convert("RGB")).astype(float) / 255
+    tile = picture[-104:-40, 16:80]  # the front view
+    saturation = tile.max(axis=-1) - tile.min(axis=-1)
+    orange = (saturation > 0.25) & (tile[..., 0] > tile[..., 2])
+    grey = (saturation < 0.05) & (tile[..., 0] < 0.9)
+    assert orange.sum() > 40 and grey.sum() > 150
+    rows_of = lambda mask: np.nonzero(mask)[0].mean()  # noqa: E731
+    assert rows_of(orange) < rows_of(grey)  # the region is above the body
+
+
+def test_preview_without_light_and_into_a_file(make_scene: Make, tmp_path: Path) -> None:
+    scene = load_edit_scene(make_scene(light=""))
+    (path,) = preview_scene(scene, tmp_path / "out", views=1, size=32)
+    assert np.asarray(Image.open(path)).std() > 5
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        preview_scene(scene, tmp_path / "taken", views=1, size=16)
+
+
+def test_colours_differ() -> None:
+    colours = np.array(region_colours(6))
+    gaps = np.linalg.norm(colours[:, None] - colours[None], axis=-1)[~np.eye(6, dtype=bool)]
+    assert gaps.min() > 0.2

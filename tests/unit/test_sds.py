@@ -1,0 +1,149 @@
+"""The maths of score distillation against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from fd_mitsuba.guidance import sds
+
+
+def latents(*values: float) -> torch.Tensor:
+    return torch.tensor(values).view(-1, 1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("sds", [0.75, 0.36]), ("uniform", [1, 1]), ("fantasia3d", [0.375, 0.288]), ("inverse", [4 / 3, 1 / 0.36])],
+)
+def test_weightings(name: str, expected: list[float]) -> None:
+    assert sds.weight(name, torch.tensor([0.25, 0.64])).tolist() == pytest.approx(expected)
+
+
+def test_unknown_weighting_is_refused() -> None:
+    with pytest.raises(ValueError, match="weighting"):
+        sds.weight("snr", torch.ones(1))
+
+
+def test_noise_is_mixed_by_level() -> None:
+    # sqrt(.64) * 2 + sqrt(.36) * -1 = 1; the second latent is all noise.
+    mixed = sds.add_noise(latents(2, 7), latents(-1, 3), torch.tensor([0.64, 0.0]))
+    assert mixed.flatten().tolist() == pytest.approx([1.0, 3.0])
+
+
+def test_every_prediction_type_gives_back_the_noise() -> None:
+    generator = torch.Generator().manual_seed(1)
+    z, noise = torch.randn(2, 3, 4, 4, 4, generator=generator)
+    abar = torch.tensor([0.9, 0.5, 0.02])
+    z_t = sds.add_noise(z, noise, abar)
+    a = abar.view(-1, 1, 1, 1)
+    for kind, output in (("epsilon", noise), ("v_prediction", a.sqrt() * noise - (1 - a).sqrt() * z), ("sample", z)):
+        torch.testing.assert_close(sds.noise_from_prediction(output, z_t, abar, kind), noise, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(sds.clean_estimate(z_t, noise, abar), z, rtol=1e-3, atol=1e-4)
+
+
+def test_one_scale_guidance() -> None:
+    predictions = {"text": latents(3), "plain": latents(1)}
+    combined = sds.combine(predictions, sds.cfg_coefficients(7.5))
+    assert combined.item() == pytest.approx(1 + 7.5 * (3 - 1))
+
+
+def test_two_scale_guidance() -> None:
+    predictions = {"text": latents(5), "image": latents(2), "plain": latents(1)}
+    combined = sds.combine(predictions, sds.cfg_coefficients_with_image(7.5, 1.5))
+    assert combined.item() == pytest.approx(1 + 1.5 * (2 - 1) + 7.5 * (5 - 2))
+
+
+def test_passes_that_do_not_count_are_left_out() -> None:
+    assert sds.cfg_coefficients(1) == {"text": 1}
+    assert sds.cfg_coefficients(0) == {"plain": 1}
+    assert set(sds.cfg_coefficients_with_image(7.5, 1)) == {"text", "image"}
+    assert sds.cfg_coefficients_with_image(1, 1) == {"text": 1}
+    assert set(sds.cfg_coefficients_with_image(1.5, 1.5)) == {"text", "plain"}
+
+
+def test_gradients() -> None:
+    weights = torch.tensor([0.5, 2.0])
+    assert sds.sds_gradient(latents(3, 1), latents(1, 2), weights).flatten().tolist() == [1.0, -2.0]
+    assert sds.csd_gradient(latents(3, 1), latents(1, 2), weights).flatten().tolist() == [1.0, -2.0]
+    assert sds.reconstruction_gradient(latents(4, 0), latents(2, 1), weights).flatten().tolist() == [1.0, -2.0]
+
+
+def test_sds_of_a_linear_denoiser_in_closed_form() -> None:
+    """With e_hat = a z_t + b the gradient is w ((a sqrt(abar)) z + (a sqrt(1 - abar) - 1) e + b)."""
+    generator = torch.Generator().manual_seed(2)
+    z, noise = torch.randn(2, 2, 4, 8, 8, generator=generator)
+    abar, a, b = torch.tensor([0.8, 0.3]), 0.6, -0.2
+    noise_hat = a * sds.add_noise(z, noise, abar) + b
+    gradient = sds.sds_gradient(noise_hat, noise, sds.weight("sds", abar))
+    for row, level in enumerate((0.8, 0.3)):
+        kept, lost = math.sqrt(level), math.sqrt(1 - level)
+        expected = (1 - level) * (a * kept * z[row] + (a * lost - 1) * noise[row] + b)
+        torch.testing.assert_close(gradient[row], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_one_step_reconstruction_is_reweighted_sds() -> None:
+    generator = torch.Generator().manual_seed(3)
+    z, noise, noise_hat = torch.randn(3, 1, 4, 8, 8, generator=generator)
+    abar = torch.tensor([0.4])
+    z_hat = sds.clean_estimate(sds.add_noise(z, noise, abar), noise_hat, abar)
+    got = sds.reconstruction_gradient(z, z_hat, torch.ones(1))
+    expected = sds.sds_gradient(noise_hat, noise, torch.ones(1)) * math.sqrt(0.6 / 0.4)
+    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_ddim_step_keeps_the_line_from_latents_to_noise() -> None:
+    generator = torch.Generator().manual_seed(4)
+    z, noise = torch.randn(2, 1, 4, 8, 8, generator=generator)
+    high, low = torch.tensor([0.2]), torch.tensor([0.7])
+    stepped = sds.ddim_step(sds.add_noise(z, noise, high), noise, high, low)
+    torch.testing.assert_close(stepped, sds.add_noise(z, noise, low), rtol=1e-4, atol=1e-5)
+
+
+def test_timesteps_fill_their_range_evenly() -> None:
+    drawn = sds.draw_timesteps((0.02, 0.35), 1000, 20000, torch.Generator().manual_seed(0))
+    assert drawn.dtype == torch.int64
+    assert (drawn.min(), drawn.max()) == (20, 350)
+    assert drawn.float().mean().item() == pytest.approx(185, abs=3)
+    counts = torch.bincount((drawn - 20) // 83)[:4] / 20000
+    assert counts.tolist() == pytest.approx([83 / 331] * 4, abs=0.015)
+
+
+def test_timesteps_repeat_with_the_generator_and_stay_in_bounds() -> None:
+    first, second = (sds.draw_timesteps((0.0, 1.0), 50, 500, torch.Generator().manual_seed(seed)) for seed in (5, 5))
+    assert first.equal(second)
+    assert first.min() >= 1 and first.max() == 49
+    assert sds.draw_timesteps((0.5, 0.5), 1000, 3, torch.Generator().manual_seed(1)).unique().tolist() == [500]
+
+
+def test_anneal_brings_the_upper_end_down() -> None:
+    assert sds.annealed_range((0.2, 0.8), 0.0, 1.0) == (0.2, 0.8)
+    assert sds.annealed_range((0.2, 0.8), 0.5, 0.0) == (0.2, 0.8)
+    assert sds.annealed_range((0.2, 0.8), 0.5, 1.0) == pytest.approx((0.2, 0.5))
+    assert sds.annealed_range((0.2, 0.8), 1.0, 0.5) == pytest.approx((0.2, 0.5))
+
+
+def test_normalised_gradient_has_mean_size_one() -> None:
+    assert sds.normalising_scale(latents(1.0, -3.0)) == 0.5
+    assert math.isfinite(sds.normalising_scale(latents(0.0, 0.0)))
+
+
+def test_carried_gradient_is_exact_however_small() -> None:
+    """The detached-target form loses a gradient of 1e-9 beside latents of size 1; this one does not."""
+    inputs = torch.ones(2, 4, requires_grad=True)
+    gradient = torch.full((2, 4), 1e-9)
+    loss = sds.carry_gradient(inputs, gradient, 3.5)
+    assert loss.item() == 3.5
+    (2 * loss).backward()
+    assert inputs.grad.equal(2 * gradient)
+
+
+def test_carried_gradient_agrees_with_the_detached_target() -> None:
+    generator = torch.Generator().manual_seed(6)
+    values, gradient = torch.randn(2, 3, 4, dtype=torch.float64, generator=generator)
+    first, second = (values.clone().requires_grad_() for _ in range(2))
+    (0.5 * (first - (first - gradient).detach()).square().sum()).backward()
+    sds.carry_gradient(second, gradient, 0.0).backward()
+    torch.testing.assert_close(first.grad, second.grad)
