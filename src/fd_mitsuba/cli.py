@@ -1,13 +1,18 @@
-"""The command line: parse, call, print. Exit codes: 0 done, 1 bad input, 2 usage, 130 interrupted after a checkpoint."""
+"""The command line: parse, call, print.
+
+Exit codes: 0 done, 1 bad input, 2 usage, 130 interrupted (a run within its steps writes a checkpoint first).
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
+import shlex
 import sys
 import warnings
 from pathlib import Path
+from typing import NoReturn
 
 from fd_mitsuba import __version__
 from fd_mitsuba.config import load_config
@@ -18,8 +23,9 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code; user errors become one line on stderr."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(arguments)
+    options.command_line = shlex.join(["fd_mitsuba", *arguments])
     verbose = getattr(options, "verbose", False)
     try:
         return options.call(options)
@@ -32,24 +38,37 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"fd_mitsuba: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("fd_mitsuba: interrupted before the first step; nothing was lost", file=sys.stderr)
+        remedy = "; continue with --resume" if options.call is _run else ""
+        print(f"fd_mitsuba: interrupted{remedy}", file=sys.stderr)
         return 130
     except OSError as error:
         if verbose:
             raise
-        print(f"fd_mitsuba: error: {error.filename or 'output'}: {error.strerror or error}; free space or check the path", file=sys.stderr)
+        print(
+            f"fd_mitsuba: error: {error.filename or 'output'}: {error.strerror or error}; free space or check the path",
+            file=sys.stderr,
+        )
         return 1
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage text before it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}; see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="fd_mitsuba", description="Text-driven, part-wise 3D editing on Mitsuba 3.")
+    parser = _Parser(prog="fd_mitsuba", description="Text-driven, part-wise 3D editing on Mitsuba 3.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="grow the part that the scene asks for")
     _scene_options(run)
     run.add_argument("-c", "--config", metavar="FILE", help="settings (TOML); default: the paper's")
-    run.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
+    run.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting"
+    )
     run.add_argument("-o", "--output", metavar="FOLDER", help="run folder; default: runs/<scene>")
     run.add_argument("--prompt", help="instead of the scene's prompt")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run in the output folder")
@@ -80,9 +99,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="Mitsuba scene file (XML)")
-    parser.add_argument("-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene")
+    parser.add_argument(
+        "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
+    )
     parser.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant")
-    parser.add_argument("-t", "--threads", type=int, default=0, metavar="N", help="threads; 0: all cores, 1: bit-reproducible")
+    parser.add_argument(
+        "-t", "--threads", type=int, default=0, metavar="N", help="threads; 0: all cores, 1: bit-reproducible"
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and library warnings")
 
 
@@ -90,16 +113,16 @@ def _run(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
     config = load_config(options.config, options.overrides)
+    prompt = None if options.prompt is None else " ".join(options.prompt.split())
+    if prompt == "":
+        raise UserError("--prompt: is blank; say what the edited object shall look like")
     scene = _load(options)
-    if options.prompt is not None:
-        if not options.prompt.strip():
-            raise UserError("--prompt: is blank; say what the edited object shall look like")
-        scene = replace(scene, prompt=options.prompt)
+    if prompt is not None:
+        scene = replace(scene, prompt=prompt)
     from fd_mitsuba.pipeline import run
 
     folder = Path(options.output) if options.output else Path("runs") / Path(options.scene).resolve().parent.name
-    command = " ".join(["fd_mitsuba", *sys.argv[1:]])
-    metrics = run(scene, config, folder, options.resume, command, options.quiet, lambda line: print(line, file=sys.stderr))
+    metrics = run(scene, config, folder, options.resume, options.command_line, options.quiet, _remark)
     print(f"{folder}: part in export/, pictures in images/turntable.png and videos/turntable.mp4")
     print(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
@@ -157,8 +180,13 @@ def _prior(options: argparse.Namespace) -> int:
         for synonyms in words[group].values():
             print(f"  {', '.join(synonyms)}")
     print(f"adjectives: {', '.join(words['adjectives'])}")
-    print('a prompt is a sentence such as "a horse with two wings"; for anything else set guidance.model to Stable Diffusion weights')
+    print('a prompt is a sentence such as "a horse with two wings"; for anything else set guidance.model to the')
+    print("folder or hub id of a Stable Diffusion model")
     return 0
+
+
+def _remark(line: str) -> None:
+    print(f"fd_mitsuba: {line}", file=sys.stderr)
 
 
 def _load(options: argparse.Namespace):
@@ -185,5 +213,3 @@ def _load(options: argparse.Namespace):
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
     return load_edit_scene(options.scene, parameters)
-
-

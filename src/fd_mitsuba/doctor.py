@@ -23,12 +23,18 @@ class Finding(NamedTuple):
 def examine() -> list[Finding]:
     """Look at Python, the CPU, LLVM, Mitsuba, torch and the built-in prior, in the order a run needs them."""
     return [
-        Finding("python", sys.version_info >= (3, 11), f"{platform.python_version()} ({platform.machine()}); 3.11 or newer is needed"),
+        Finding(
+            "python",
+            sys.version_info >= (3, 11),
+            f"{platform.python_version()} ({platform.machine()}); 3.11 or newer is needed",
+        ),
         Finding("cores", True, str(os.cpu_count())),
         _attempt("llvm", _llvm),
         _attempt("mitsuba", _mitsuba),
         _attempt("torch", _torch),
-        _attempt("diffusers", lambda: f"{metadata.version('diffusers')}, transformers {metadata.version('transformers')}"),
+        _attempt(
+            "diffusers", lambda: f"{metadata.version('diffusers')}, transformers {metadata.version('transformers')}"
+        ),
         _attempt("built-in prior", _prior),
         _attempt("memory", _memory),
     ]
@@ -37,7 +43,7 @@ def examine() -> list[Finding]:
 def _attempt(name: str, look: Callable[[], str]) -> Finding:
     try:
         return Finding(name, True, look())
-    except (UserError, ImportError, metadata.PackageNotFoundError, OSError) as error:
+    except (UserError, ImportError, OSError, RuntimeError) as error:  # whatever it is, the report must go on
         return Finding(name, False, " ".join(str(error).split()))
 
 

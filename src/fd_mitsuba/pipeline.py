@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import platform
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib import metadata
 from pathlib import Path
 
 import torch
@@ -21,9 +17,10 @@ from fd_mitsuba.evaluation.turntable import render_ring, write_sheet, write_vide
 from fd_mitsuba.export.meshes import copy_base, write_mesh
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.training.checkpoint import list_checkpoints, load_newest, write_atomically
+from fd_mitsuba.training.checkpoint import list_checkpoints, load_newest
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import STAGE, run_geometry
+from fd_mitsuba.training.run_folder import check_folder, describe_run, write_json
 
 _SHEET_VIEWS = 8
 
@@ -40,7 +37,8 @@ def run(
     """Grow the part and write the run folder; returns what `metrics.json` holds.
 
     Args:
-        folder: made if it is missing; must be empty or hold an interrupted run of the same scene and settings (`resume`).
+        folder: made if it is missing; must be empty, or hold a run of the same scene and settings to go on with.
+        resume: go on with the run in `folder`.
         command: the command line, for the record.
         say: takes remarks for the user, a line each.
 
@@ -48,45 +46,16 @@ def run(
         UserError, RunStopped, Interrupted: see `training.loop.run_geometry`.
     """
     started = time.monotonic()
-    prepare_folder(scene, config, folder, resume, command)
-    guidance = DiffusionGuidance.load(config.guidance)
-    unknown = guidance.set_prompt(scene.prompt, scene.negative_prompt)
-    if unknown:
-        say(
-            f"the prompt's {', '.join(map(repr, unknown))} {'is' if len(unknown) == 1 else 'are'} outside the built-in prior's "
-            "vocabulary and will not steer the result; `fd_mitsuba prior` lists the words it knows"
-        )
+    check_folder(scene, config, folder, resume)
+    # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
+    guidance = _guidance(scene, config, say)
     stage = GeometryStage(scene, config, guidance)
+    describe_run(scene, config, folder, command)
     run_geometry(stage, folder, resume, quiet, say)
     metrics = export_geometry(stage, folder)
     metrics["seconds"] = round(time.monotonic() - started, 1)
-    write_atomically(folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    write_json(folder / "metrics.json", metrics)
     return metrics
-
-
-def prepare_folder(scene: EditScene, config: RunConfig, folder: Path, resume: bool, command: str) -> None:
-    """Make the run folder and write down what the run is made of: command, settings, environment, the scene's files.
-
-    Raises:
-        UserError: the folder holds something else, or an interrupted run without `resume`, or cannot be written.
-    """
-    settings = json.dumps(config.model_dump(mode="json"), indent=2) + "\n"
-    identity = {"scene": str(scene.path.resolve()), "prompt": scene.prompt, "parameters": scene.parameters,
-                "config_hash": config.content_hash()}
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is a file; choose another -o folder")
-    if folder.exists() and any(folder.iterdir()):
-        known = (folder / "run.json").exists() or (folder / "command.txt").exists()
-        if not known:
-            raise UserError(f"{folder}: not empty and not a run; choose another -o folder")
-        if not resume:
-            raise UserError(f"{folder}: holds a run already; add --resume to go on with it, or choose another -o folder")
-        _refuse_other_run(folder, identity)
-    write_atomically(folder / "command.txt", (command + "\n").encode())
-    write_atomically(folder / "config.json", settings.encode())
-    write_atomically(folder / "environment.json", (json.dumps(_environment(), indent=2) + "\n").encode())
-    _copy_scene(scene, folder / "scene")
-    write_atomically(folder / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
 
 
 def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> GeometryStage:
@@ -94,7 +63,9 @@ def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> Ge
     stage = GeometryStage(scene, config, None)
     if not list_checkpoints(folder / "checkpoints"):
         raise UserError(f"{folder / 'checkpoints'}: no checkpoint; run the geometry stage first")
-    load_newest(folder / "checkpoints", STAGE, config.content_hash(), stage.field, stage.optimiser)
+    done, _ = load_newest(folder / "checkpoints", STAGE, config.content_hash(), stage.field, stage.optimiser)
+    if not done:
+        raise UserError(f"{folder / 'checkpoints'}: every checkpoint is damaged; run the geometry stage again")
     return stage
 
 
@@ -134,7 +105,9 @@ def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tenso
         union = stage.surface()
     start = stage.start_surface()
     edited = (union.vertices, union.faces)
-    write_video(render_ring(edited, output.turntable_frames, output.turntable_size, aim), folder / "videos" / "turntable.mp4")
+    write_video(
+        render_ring(edited, output.turntable_frames, output.turntable_size, aim), folder / "videos" / "turntable.mp4"
+    )
     size = min(output.turntable_size, 192)
     rows = {
         "base": render_ring((stage.base_surface.vertices, stage.base_surface.faces), _SHEET_VIEWS, size, aim),
@@ -145,40 +118,15 @@ def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tenso
     write_sheet(rows, folder / "images" / "turntable.png")
 
 
-def _refuse_other_run(folder: Path, identity: dict) -> None:
-    path = folder / "run.json"
-    if not path.exists():
-        return
-    try:
-        known = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError):
-        raise UserError(f"{path}: cannot be read; choose another -o folder") from None
-    for key, value in identity.items():
-        if known.get(key) != value:
-            raise UserError(
-                f"{folder}: holds a run with another {key.replace('_', ' ')} ({known.get(key)!r}, now {value!r}); "
-                "resume with the run's own scene, -c, --set and -D, or choose another -o folder"
-            )
-
-
-def _copy_scene(scene: EditScene, folder: Path) -> None:
-    """Copies of every file that the scene reads, flat, for the record; the run itself reads the originals."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in scene.files:
-            target = folder / Path(file).name
-            if not target.exists():
-                shutil.copyfile(file, target)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror}); free space or choose another -o folder") from None
-
-
-def _environment() -> dict[str, str | int]:
-    names = ("mitsuba", "drjit", "torch", "diffusers", "transformers", "numpy", "libigl")
-    return {
-        "fd_mitsuba": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "threads": torch.get_num_threads(),
-        **{name: metadata.version(name) for name in names},
-    }
+def _guidance(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -> DiffusionGuidance | None:
+    if config.geometry.lambda_sds == 0:
+        return None
+    guidance = DiffusionGuidance.load(config.guidance)
+    unknown = guidance.set_prompt(scene.prompt, scene.negative_prompt)
+    if unknown:
+        verb = "is" if len(unknown) == 1 else "are"
+        say(
+            f"the prompt's {', '.join(map(repr, unknown))} {verb} outside the built-in prior's vocabulary and will not "
+            "steer the result; `fd_mitsuba prior` lists the words it knows"
+        )
+    return guidance

@@ -33,8 +33,8 @@ def measure_locality(
     """Counts of a regular lattice over the part's bounding box, `samples` points along its longest side.
 
     Args:
-        part, base: (vertices, faces), canonical frame. Inside is decided by winding numbers, not by the fields that were
-            trained, so this measures what is exported.
+        part, base: (vertices, faces), canonical frame. Inside is decided by winding numbers, not by the fields that
+            were trained, so this measures what is exported.
         regions: the focal regions, canonical frame.
         band: free distance around the regions, canonical units.
     """
@@ -43,7 +43,9 @@ def measure_locality(
         return Locality(0.0, 0.0, 0.0)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = float((high - low).max()) / samples
-    axes = [np.arange(low[i] + step / 2, high[i] + step / 2, step) for i in range(3)]
+    if step == 0:
+        return Locality(0.0, 0.0, 0.0)
+    axes = [low[i] + step * (np.arange(max(1, np.ceil((high[i] - low[i]) / step))) + 0.5) for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     points = points[MeshDistance(vertices, faces).inside(points)]
     if len(points) == 0:

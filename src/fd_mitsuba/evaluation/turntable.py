@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from fd_mitsuba.errors import UserError
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
-from fd_mitsuba.training.record import normal_pictures
+from fd_mitsuba.training.checkpoint import write_atomically
+from fd_mitsuba.training.record import normal_pictures, write_picture
 
 Mesh = tuple[torch.Tensor, torch.Tensor]
 
@@ -28,12 +28,16 @@ def render_ring(mesh: Mesh, count: int, size: int, aim: np.ndarray, elevation_de
 
 
 def write_video(frames: np.ndarray, path: Path, frames_per_second: int = 16) -> None:
-    """H.264 video of frames (count, height, width, 3) uint8; height and width must be even."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        imageio.imwrite(path, frames, plugin="pyav", codec="libx264", fps=frames_per_second)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error}); free space or choose another -o folder") from None
+    """Write an H.264 video of frames (count, height, width, 3) uint8, whole or not at all.
+
+    The codec wants even sides: an odd one is repeated at its edge.
+    """
+    odd = [(0, side % 2) for side in frames.shape[1:3]]
+    frames = np.pad(frames, [(0, 0), *odd, (0, 0)], mode="edge")
+    data = imageio.imwrite(
+        "<bytes>", frames, extension=path.suffix, plugin="pyav", codec="libx264", fps=frames_per_second
+    )
+    write_atomically(path, data)
 
 
 def write_sheet(rows: dict[str, np.ndarray], path: Path) -> None:
@@ -47,5 +51,4 @@ def write_sheet(rows: dict[str, np.ndarray], path: Path) -> None:
         top = index * (size + caption)
         draw.text((6, top + 3), name, fill=(235, 235, 235))
         sheet.paste(Image.fromarray(np.concatenate(list(frames), axis=1)), (0, top + caption))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(path)
+    write_picture(path, sheet)

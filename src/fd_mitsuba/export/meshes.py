@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import shutil
+import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -33,29 +33,34 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray, scene: EditS
 def copy_base(scene: EditScene, folder: Path) -> bool:
     """Copy the base's own files into `folder` and return whether every copy has the bytes of its source.
 
-    An analytic shape has no file: its triangles are written as PLY, and do not count as a copy. Files of the same name
-    from different folders keep both: the later gets its shape's name in front.
+    An analytic shape has no file: its triangles are written as PLY, and do not count as a copy. A name that is taken
+    already, as by a file of another folder, gets its shape's name in front.
+
+    Raises:
+        UserError: a source that cannot be read any more, a folder that cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    identical, taken = True, {}
+    identical, taken, copied = True, set(), set()
     for mesh in scene.base:
         if not mesh.source_files:
-            write_atomically(folder / f"{mesh.name}.ply", ply_bytes(mesh.vertices, mesh.faces))
-        for source in mesh.source_files:
-            source = Path(source).resolve()
-            if source in taken.values():
+            name = _free_name(f"{mesh.name}.ply", mesh.name, taken)
+            write_atomically(folder / name, ply_bytes(mesh.vertices, mesh.faces))
+        for source in (Path(source).resolve() for source in mesh.source_files):
+            if source in copied:
                 continue
-            target = folder / source.name
-            if target.name in taken:
-                target = folder / f"{mesh.name}_{source.name}"
-            taken[target.name] = source
+            copied.add(source)
+            target = folder / _free_name(source.name, mesh.name, taken)
             try:
-                shutil.copyfile(source, target)
+                data = source.read_bytes()
             except OSError as error:
-                raise UserError(f"{target}: cannot be written ({error.strerror}); free space or choose another -o") from None
-            identical &= _digest(source) == _digest(target)
+                raise UserError(f"{source}: cannot be read any more ({error.strerror}); put the file back") from None
+            write_atomically(target, data)
+            identical &= target.read_bytes() == data
     return identical
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _free_name(wanted: str, prefix: str, taken: set[str]) -> str:
+    """`wanted`, or with the prefix and a number where that is taken; without what cannot be in a file name."""
+    candidates = itertools.chain([wanted, f"{prefix}_{wanted}"], (f"{prefix}_{i}_{wanted}" for i in itertools.count(2)))
+    name = next(name for name in (re.sub(r"[^\w.-]", "_", c) for c in candidates) if name not in taken)
+    taken.add(name)
+    return name

@@ -5,11 +5,24 @@ from __future__ import annotations
 import numpy as np
 
 BODY_WORDS: dict[str, tuple[str, ...]] = {
-    "horse": ("horse", "pony", "stallion"), "dog": ("dog", "puppy", "hound"), "cat": ("cat", "kitten"), "deer": ("deer", "stag"),
-    "cow": ("cow", "bull"), "pig": ("pig", "piglet"), "bear": ("bear", "teddy bear"), "rabbit": ("rabbit", "bunny"),
-    "person": ("person", "figure", "man"), "robot": ("robot", "android"), "snowman": ("snowman",), "duck": ("duck", "bird"),
-    "turtle": ("turtle", "tortoise"), "fish": ("fish",), "vase": ("vase", "jar"), "mug": ("mug", "cup"),
-    "pumpkin": ("pumpkin",), "ball": ("ball", "sphere"),
+    "horse": ("horse", "pony", "stallion"),
+    "dog": ("dog", "puppy", "hound"),
+    "cat": ("cat", "kitten"),
+    "deer": ("deer", "stag"),
+    "cow": ("cow", "bull"),
+    "pig": ("pig", "piglet"),
+    "bear": ("bear", "teddy bear"),
+    "rabbit": ("rabbit", "bunny"),
+    "person": ("person", "figure", "man"),
+    "robot": ("robot", "android"),
+    "snowman": ("snowman",),
+    "duck": ("duck", "bird"),
+    "turtle": ("turtle", "tortoise"),
+    "fish": ("fish",),
+    "vase": ("vase", "jar"),
+    "mug": ("mug", "cup"),
+    "pumpkin": ("pumpkin",),
+    "ball": ("ball", "sphere"),
 }
 """Synonyms a body; the first is the one that messages use."""
 
@@ -59,6 +72,11 @@ def view_words(azimuth_deg: float, closeup: bool) -> str:
 def vocabulary() -> list[str]:
     """Every word of every caption, sorted."""
     texts = [w for words in (*BODY_WORDS.values(), *PART_WORDS.values(), *SYNONYM_WHOLES.values()) for w in words]
-    texts += [*ADJECTIVES, *AZIMUTH_WORDS, CLOSEUP_WORD, "a an the with that has wearing on standing riding and of its head",
-              "side top back front view"]
+    texts += [
+        *ADJECTIVES,
+        *AZIMUTH_WORDS,
+        CLOSEUP_WORD,
+        "a an the with that has wearing on standing riding and of its head",
+        "side top back front view",
+    ]
     return sorted({word for text in texts for word in text.split()})

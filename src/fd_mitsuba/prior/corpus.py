@@ -53,8 +53,10 @@ class RayCaster:
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,), inf where nothing is hit, and world normal (N, 3) for rays (N, 3), (N, 3)."""
         mi = self._mi
-        ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray(origins.T, np.float32)),
-                       mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)))
+        ray = mi.Ray3f(
+            mi.Point3f(np.ascontiguousarray(origins.T, np.float32)),
+            mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)),
+        )
         hit = self._scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
         return np.array(hit.t), np.array(hit.sh_frame.n).T
 
@@ -87,7 +89,9 @@ class MosaicCamera:
         origins, directions, rotations = [], [], []
         for quarter in range(4):
             azimuth, elevation = np.deg2rad(self.azimuth_deg + 90 * quarter), np.deg2rad(self.elevation_deg)
-            back = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
+            back = np.array(
+                [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+            )
             right = np.array([np.cos(azimuth), 0, -np.sin(azimuth)])
             world_to_camera = np.stack([right, np.cross(back, right), back])
             directions.append(local @ world_to_camera)
@@ -104,7 +108,9 @@ def shade(distance: np.ndarray, normal: np.ndarray, rotations: np.ndarray) -> np
     both = np.concatenate([camera, mask], -1)
     both = both.reshape(4, VIEW_SIZE, step, VIEW_SIZE, step, 4).mean((2, 4))
     both[..., 3] = 2 * both[..., 3] - 1
-    mosaic = both.reshape(2, 2, VIEW_SIZE, VIEW_SIZE, 4).transpose(4, 0, 2, 1, 3).reshape(4, 2 * VIEW_SIZE, 2 * VIEW_SIZE)
+    mosaic = (
+        both.reshape(2, 2, VIEW_SIZE, VIEW_SIZE, 4).transpose(4, 0, 2, 1, 3).reshape(4, 2 * VIEW_SIZE, 2 * VIEW_SIZE)
+    )
     return np.clip(np.rint(mosaic * 127), -127, 127).astype(np.int8)
 
 
@@ -119,7 +125,9 @@ def _closeup_camera(part: Solid, rng: np.random.Generator) -> MosaicCamera:
     radius = np.linalg.norm(high - low) / 2
     half = np.clip(radius * rng.uniform(1.1, 1.9), 0.3, 1.25)
     fov = 2 * np.rad2deg(np.arctan(half / CAMERA_RADIUS))
-    return MosaicCamera(rng.uniform(0, 90), rng.uniform(-10, 45), fov, (low + high) / 2 + rng.uniform(-0.2, 0.2, 3) * radius)
+    return MosaicCamera(
+        rng.uniform(0, 90), rng.uniform(-10, 45), fov, (low + high) / 2 + rng.uniform(-0.2, 0.2, 3) * radius
+    )
 
 
 def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
@@ -143,8 +151,20 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
             if caster is not None:
                 part_distance, part_normal = caster.cast(origins, directions)
                 nearer = part_distance < distance
-                distance, normal = np.where(nearer, part_distance, distance), np.where(nearer[:, None], part_normal, normal)
+                distance, normal = (
+                    np.where(nearer, part_distance, distance),
+                    np.where(nearer[:, None], part_normal, normal),
+                )
             words = f"{caption(body, part, rng)}, {view_words(camera.azimuth_deg, closeup)}"
-            pairs.append(Pair(shade(*base_hits, rotations), shade(distance, normal, rotations), words, body, part,
-                              camera.azimuth_deg, closeup))
+            pairs.append(
+                Pair(
+                    shade(*base_hits, rotations),
+                    shade(distance, normal, rotations),
+                    words,
+                    body,
+                    part,
+                    camera.azimuth_deg,
+                    closeup,
+                )
+            )
     return pairs

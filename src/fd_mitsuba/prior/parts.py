@@ -37,8 +37,11 @@ def wings(body: Body, rng: Rng) -> Solid:
     front = np.broadcast_to([0.0, 0.0, 1.0], path.shape)
     normal = np.cross(path, front)
     thickness = thick * (1 - 0.55 * share)[:, None]
-    right = sweep(centres, normal * thickness, front * width[:, None], 14) if np.linalg.det(
-        np.stack([normal[0], front[0], path[0]])) > 0 else sweep(centres, front * width[:, None], normal * thickness, 14)
+    right = (
+        sweep(centres, normal * thickness, front * width[:, None], 14)
+        if np.linalg.det(np.stack([normal[0], front[0], path[0]])) > 0
+        else sweep(centres, front * width[:, None], normal * thickness, 14)
+    )
     return join([right, mirror_x(right)])
 
 
@@ -47,7 +50,9 @@ def horn(body: Body, rng: Rng) -> Solid:
     size = _head_size(body)
     length, radius = _jitter(rng, 2.2) * size, _jitter(rng, 0.27) * size
     tip = body.forehead + body.horn_direction * length
-    return tube([body.forehead - body.horn_direction * radius, (body.forehead + tip) / 2, tip], [radius, radius * 0.55, 0.012])
+    return tube(
+        [body.forehead - body.horn_direction * radius, (body.forehead + tip) / 2, tip], [radius, radius * 0.55, 0.012]
+    )
 
 
 def antlers(body: Body, rng: Rng) -> Solid:
@@ -59,8 +64,10 @@ def antlers(body: Body, rng: Rng) -> Solid:
     tip = root + length * np.array([0.55, 1.0, 0.02])
     main = tube([root, bend, tip], [radius * 1.1, radius, radius * 0.6])
     middle = (bend + tip) / 2
-    tines = [tube([bend, bend + length * np.array([0.02, 0.22, 0.34])], [radius, radius * 0.6]),
-             tube([middle, middle + length * np.array([0.32, 0.24, 0.04])], [radius * 0.9, radius * 0.55])]
+    tines = [
+        tube([bend, bend + length * np.array([0.02, 0.22, 0.34])], [radius, radius * 0.6]),
+        tube([middle, middle + length * np.array([0.32, 0.24, 0.04])], [radius * 0.9, radius * 0.55]),
+    ]
     right = join([main, *tines])
     return join([right, mirror_x(right)])
 
@@ -75,15 +82,29 @@ def _on_head(body: Body, profile: list[tuple[float, float]], rng: Rng) -> Solid:
 def pointed_hat(body: Body, rng: Rng) -> Solid:
     """A cone with a wide flat brim."""
     tall, brim = _jitter(rng, 2.5), _jitter(rng, 1.6, 0.08)
-    return _on_head(body, [(brim * 0.96, 0), (brim, 0.08), (brim * 0.96, 0.16), (0.92, 0.22), (0.5, 0.1 + tall * 0.5), (0.04, tall)],
-                    rng)
+    return _on_head(
+        body,
+        [(brim * 0.96, 0), (brim, 0.08), (brim * 0.96, 0.16), (0.92, 0.22), (0.5, 0.1 + tall * 0.5), (0.04, tall)],
+        rng,
+    )
 
 
 def top_hat(body: Body, rng: Rng) -> Solid:
     """A tall flat-topped cylinder with a brim."""
     tall, brim = _jitter(rng, 1.9), _jitter(rng, 1.5, 0.08)
-    return _on_head(body, [(brim * 0.96, 0), (brim, 0.08), (brim * 0.96, 0.16), (0.88, 0.2), (0.86, tall * 0.6), (0.94, tall),
-                           (0.9, tall + 0.05)], rng)
+    return _on_head(
+        body,
+        [
+            (brim * 0.96, 0),
+            (brim, 0.08),
+            (brim * 0.96, 0.16),
+            (0.88, 0.2),
+            (0.86, tall * 0.6),
+            (0.94, tall),
+            (0.9, tall + 0.05),
+        ],
+        rng,
+    )
 
 
 def crown(body: Body, rng: Rng) -> Solid:
@@ -96,8 +117,13 @@ def crown(body: Body, rng: Rng) -> Solid:
     for angle in np.arange(6) * np.pi / 3 + rng.uniform(0, 0.2):
         around = np.array([np.sin(angle), 0, np.cos(angle)])
         foot = around * outer * 1.0 + np.array([0, tall * 0.9, 0])
-        prongs.append(tube([foot, foot + around * 0.14 * size + np.array([0, tall * 1.35, 0])], [0.26 * size, 0.05 * size],
-                           flatten=0.8))
+        prongs.append(
+            tube(
+                [foot, foot + around * 0.14 * size + np.array([0, tall * 1.35, 0])],
+                [0.26 * size, 0.05 * size],
+                flatten=0.8,
+            )
+        )
     return transform(join([band, *prongs]), shift=body.head_top - np.array([0, 0.2 * size, 0]))
 
 
@@ -106,7 +132,9 @@ def handle(body: Body, rng: Rng) -> Solid:
     tall, out = _jitter(rng, 0.42) * body.side_height + 0.08, _jitter(rng, 0.4) * body.side_height + 0.1
     radius = 0.05 + 0.05 * body.side_height
     angle = np.linspace(-np.pi / 2, np.pi / 2, 11)
-    loop = np.stack([body.side[0] - 0.06 + out * np.cos(angle), body.side[1] + tall * np.sin(angle), np.zeros_like(angle)], 1)
+    loop = np.stack(
+        [body.side[0] - 0.06 + out * np.cos(angle), body.side[1] + tall * np.sin(angle), np.zeros_like(angle)], 1
+    )
     return tube(loop, np.full(11, radius))
 
 
@@ -119,10 +147,20 @@ def skateboard(body: Body, rng: Rng) -> Solid:
     width = half_x * np.sqrt(np.clip(1.04 - (np.abs(z) / half_z) ** 6, 0.02, None))
     zero = np.zeros_like(z)
     centre = np.array([0, body.bottom - thick * 0.6, body.foot_centre_z])
-    deck = sweep(centre + np.stack([zero, rise, z], 1), np.stack([width, zero, zero], 1), np.stack([zero, zero + thick, zero], 1),
-                 14, exponent=0.6)
-    wheels = [ellipsoid(centre + (sx * half_x * 0.75, -thick - wheel * 0.75, sz * half_z * 0.6), (0.06, wheel, wheel), exponent=0.6)
-              for sx in (1, -1) for sz in (1, -1)]
+    deck = sweep(
+        centre + np.stack([zero, rise, z], 1),
+        np.stack([width, zero, zero], 1),
+        np.stack([zero, zero + thick, zero], 1),
+        14,
+        exponent=0.6,
+    )
+    wheels = [
+        ellipsoid(
+            centre + (sx * half_x * 0.75, -thick - wheel * 0.75, sz * half_z * 0.6), (0.06, wheel, wheel), exponent=0.6
+        )
+        for sx in (1, -1)
+        for sz in (1, -1)
+    ]
     axles = [box(centre + (0, -thick - wheel * 0.5, sz * half_z * 0.6), (half_x * 0.75, 0.03, 0.04)) for sz in (1, -1)]
     return join([deck, *wheels, *axles])
 

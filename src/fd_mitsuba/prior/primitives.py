@@ -100,7 +100,9 @@ def tube(points: Array, radii: Array, segments: int = 12, flatten: float = 1.0) 
     return sweep(centres, across * radii[:, None], along * radii[:, None] * flatten, segments)
 
 
-def ellipsoid(centre: Array | tuple, half_axes: Array | tuple, turn: Array | None = None, exponent: float = 1.0) -> Solid:
+def ellipsoid(
+    centre: Array | tuple, half_axes: Array | tuple, turn: Array | None = None, exponent: float = 1.0
+) -> Solid:
     """An ellipsoid, or with `exponent` below 1 a rounded box, about its centre with half-axes (3,)."""
     latitudes = np.linspace(-np.pi / 2, np.pi / 2, 13)[1:-1]
     height = np.sign(np.sin(latitudes)) * np.abs(np.sin(latitudes)) ** exponent

@@ -47,8 +47,16 @@ class Pool:
         return base, edited, [p.caption for p in chosen]
 
 
-def train(folder: Path, seconds: float, *, batch_size: int = 8, learning_rate: float = 8e-4, total_steps: int = 5000,
-          seed: int = 0, init: Path | None = None) -> None:
+def train(
+    folder: Path,
+    seconds: float,
+    *,
+    batch_size: int = 8,
+    learning_rate: float = 8e-4,
+    total_steps: int = 5000,
+    seed: int = 0,
+    init: Path | None = None,
+) -> None:
     """Train until `total_steps` or for `seconds`, whichever is first; continue from `folder` if it holds a checkpoint.
 
     Args:
@@ -58,10 +66,16 @@ def train(folder: Path, seconds: float, *, batch_size: int = 8, learning_rate: f
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
     tokenizer = build_tokenizer()
-    encoder, unet, scheduler = build_text_encoder(tokenizer), build_unet().to(memory_format=torch.channels_last), build_scheduler()
+    encoder, unet, scheduler = (
+        build_text_encoder(tokenizer),
+        build_unet().to(memory_format=torch.channels_last),
+        build_scheduler(),
+    )
     modules = torch.nn.ModuleDict({"text_encoder": encoder, "unet": unet})
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
-    optimiser = torch.optim.AdamW(modules.parameters(), lr=learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
+    optimiser = torch.optim.AdamW(
+        modules.parameters(), lr=learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
+    )
     step, checkpoint = 0, folder / "checkpoint.pt"
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
@@ -75,8 +89,10 @@ def train(folder: Path, seconds: float, *, batch_size: int = 8, learning_rate: f
     started, saved, smooth = time.time(), time.time(), None
 
     def save() -> None:
-        torch.save({"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": step},
-                   folder / "checkpoint.tmp")
+        torch.save(
+            {"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": step},
+            folder / "checkpoint.tmp",
+        )
         os.replace(folder / "checkpoint.tmp", checkpoint)
 
     while step < total_steps and time.time() - started < seconds:
@@ -113,8 +129,13 @@ def train(folder: Path, seconds: float, *, batch_size: int = 8, learning_rate: f
         smooth = now if smooth is None else tuple(0.98 * s + 0.02 * n for s, n in zip(smooth, now, strict=True))
         pool.refresh(batch_size // 2)
         if step % 50 == 0:
-            line = {"step": step, "loss": round(smooth[0], 5), "loss_part": round(smooth[1], 5), "rate": rate,
-                    "seconds": round(time.time() - started)}
+            line = {
+                "step": step,
+                "loss": round(smooth[0], 5),
+                "loss_part": round(smooth[1], 5),
+                "rate": rate,
+                "seconds": round(time.time() - started),
+            }
             with open(folder / "log.jsonl", "a", encoding="utf-8") as log:
                 log.write(json.dumps(line) + "\n")
         if time.time() - saved > 300:

@@ -1,11 +1,14 @@
 """Checkpoints that a kill cannot spoil: one safetensors file a step, written aside and renamed.
 
-A file holds the field, the optimiser's moments, and in its header the stage, the step, the settings' hash and the format
-version. Random numbers depend on (seed, step) only, so no generator state is needed for a resumed run to go on exactly.
+A file holds the field, the optimiser's moments, and in its header the stage, the step, the settings' hash, the format
+version and a hash of the tensors: safetensors has no checksum of its own, and a flipped bit must not train on.
+Random numbers depend on (seed, step) only, so no generator state is needed for a resumed run to go on exactly.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import os
 from dataclasses import dataclass
@@ -20,6 +23,7 @@ from fd_mitsuba.errors import UserError
 
 FORMAT = 1
 _HEADER_KEY = "fd_mitsuba"
+_LITTER = ".tmp"
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ def save_checkpoint(
 ) -> Path:
     """Write a checkpoint so that it is there whole or not at all, then remove all but the newest `keep`.
 
+    Files of later steps go as well: `load_newest` passed over them as damaged, and they would push out good ones.
+
     Raises:
         UserError: the folder cannot be written (full, read-only).
     """
@@ -49,17 +55,19 @@ def save_checkpoint(
     for index, state in optimiser.state_dict()["state"].items():
         for name, value in state.items():
             tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value).contiguous()
-    data = save(tensors, metadata={_HEADER_KEY: json.dumps(vars(header), sort_keys=True)})
+    text = json.dumps({**vars(header), "sha256": _digest(tensors)}, sort_keys=True)
     path = checkpoint_path(folder, header.step)
-    write_atomically(path, data)
-    for old in list_checkpoints(folder)[:-keep]:
-        old.unlink(missing_ok=True)
+    write_atomically(path, save(tensors, metadata={_HEADER_KEY: text}))
+    files = list_checkpoints(folder)
+    place = files.index(path)
+    for other in files[: max(place + 1 - keep, 0)] + files[place + 1 :]:
+        other.unlink(missing_ok=True)
     return path
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write bytes to a neighbouring file, flush it to the disk, rename it; UserError if the folder cannot be written."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Write bytes to a neighbouring file, flush it to the disk, rename it; UserError where that cannot be done."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{_LITTER}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as file:
@@ -68,8 +76,15 @@ def write_atomically(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot be written ({error.strerror}); free space or choose another -o folder") from None
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror or error
+        raise UserError(f"{path}: cannot be written ({reason}); free space or choose another -o folder") from None
+
+
+def is_litter(path: Path) -> bool:
+    """Whether a file is what `write_atomically` leaves behind when it is killed."""
+    return path.name.startswith(".") and path.name.endswith(_LITTER)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
@@ -96,23 +111,38 @@ def load_newest(
                 header = json.loads((file.metadata() or {}).get(_HEADER_KEY, "null"))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}
         except (SafetensorError, OSError, ValueError) as error:
-            remarks.append(f"{path}: damaged checkpoint passed over ({error})")
+            remarks.append(f"{path}: damaged checkpoint passed over ({' '.join(str(error).split())})")
             continue
         _check_header(path, header, stage, config_hash)
+        if header.get("sha256") != _digest(tensors):
+            remarks.append(f"{path}: damaged checkpoint passed over (its tensors do not fit their hash)")
+            continue
         _apply(path, tensors, field, optimiser)
         return int(header["step"]), remarks
     return 0, remarks
 
 
-def _check_header(path: Path, header: dict | None, stage: str, config_hash: str) -> None:
-    if not header:
+def _digest(tensors: dict[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _check_header(path: Path, header: object, stage: str, config_hash: str) -> None:
+    if not isinstance(header, dict):
         raise UserError(f"{path}: not a checkpoint of fd_mitsuba (no header); remove it or choose another -o folder")
     if header.get("format") != FORMAT:
         raise UserError(f"{path}: checkpoint format {header.get('format')}, this version reads {FORMAT}; start anew")
     if header.get("stage") != stage:
         raise UserError(f"{path}: checkpoint of stage {header.get('stage')!r}, not {stage!r}; choose another -o folder")
     if header.get("config_hash") != config_hash:
-        raise UserError(f"{path}: made with other settings; resume with the run's own -c, --set and -D, or choose another -o")
+        raise UserError(
+            f"{path}: made with other settings; resume with the run's own -c and --set, or choose another -o"
+        )
+    if not isinstance(header.get("step"), int) or header["step"] < 0:
+        raise UserError(f"{path}: its header has no step; remove this file to resume from an earlier one")
 
 
 def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: torch.optim.Optimizer) -> None:
@@ -122,13 +152,18 @@ def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: 
         raise UserError(f"{path}: its tensors do not fit this field; choose another -o folder")
     bad = [name for name, value in tensors.items() if value.is_floating_point() and not torch.isfinite(value).all()]
     if bad:
-        raise UserError(f"{path}: {bad[0]} holds values that are not finite; remove this file to resume from an earlier one")
-    field.load_state_dict(stored)
-    state = optimiser.state_dict()
+        raise UserError(
+            f"{path}: {bad[0]} holds values that are not finite; remove this file to resume from an earlier one"
+        )
+    parameters = {str(i): p for i, p in enumerate(p for group in optimiser.param_groups for p in group["params"])}
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimiser."):
             _, index, key = name.split(".", 2)
+            if index not in parameters or (value.dim() and value.shape != parameters[index].shape):
+                raise UserError(f"{path}: {name} does not fit this optimiser; choose another -o folder")
             moments.setdefault(int(index), {})[key] = value
+    state = optimiser.state_dict()
     state["state"] = moments
+    field.load_state_dict(stored)
     optimiser.load_state_dict(state)

@@ -161,7 +161,9 @@ class GeometryStage:
         values.update({f"loss_{name}": float(loss.detach()) for name, loss in losses.items()})
         values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
         if not np.isfinite(values["loss"]):
-            raise RunStopped(f"step {step}: the loss is not finite; lower geometry.learning_rate or guidance.guidance_scale")
+            raise RunStopped(
+                f"step {step}: the loss is not finite; lower geometry.learning_rate or guidance.guidance_scale"
+            )
         if isinstance(total, Tensor) and total.requires_grad:
             self.optimiser.zero_grad(set_to_none=True)
             total.backward()
@@ -171,14 +173,15 @@ class GeometryStage:
         return StepRecord(values, pictures.detach(), preview)
 
     def check_field(self, step: int) -> dict[str, float]:
-        """The part's share of the focal regions' volume; raises RunStopped for a field that is not finite or exploded."""
+        """The part's volume over the focal regions'; raises RunStopped for a field not finite, exploded or empty."""
         sdf = self.extractor.part_sdf(self.field)
         start = self.region_sdf[self.extractor.active_index]
         if not torch.isfinite(sdf).all():
             raise RunStopped(f"step {step}: the part's field is not finite; lower geometry.learning_rate")
-        if float((sdf - start).abs().max()) > EXPLODED_BEYOND:
+        away = float((sdf - start).abs().max())
+        if away > EXPLODED_BEYOND:
             raise RunStopped(
-                f"step {step}: the part's field exploded (it is {float((sdf - start).abs().max()):.2f} away from its start); "
+                f"step {step}: the part's field exploded (it is {away:.2f} away from its start); "
                 "lower geometry.learning_rate or geometry.lambda_sds"
             )
         inside = float((sdf > 0).sum()) / max(float((start > 0).sum()), 1.0)

@@ -1,8 +1,9 @@
-"""The loop of a stage: step, record, checkpoint; stops cleanly on a signal and keeps the last good state on a failure."""
+"""The loop of a stage: step, record, checkpoint; a signal stops it cleanly, a failure leaves the last good state."""
 
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ _FIELD_CHECKED_EVERY = 10
 
 
 class _StopRequest:
-    """Set by SIGINT or SIGTERM; a second signal is left to Python."""
+    """Set by SIGINT or SIGTERM; a second signal ends the process as if nobody listened."""
 
     def __init__(self) -> None:
         self.name: str | None = None
@@ -30,14 +31,17 @@ class _StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[_StopRequest]:
-    """While open, SIGINT and SIGTERM are noted instead of ending the process."""
+    """While open, SIGINT and SIGTERM are noted instead of ending the process; outside the main thread nothing is."""
     request = _StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
     old = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield request
     finally:
         for number, handler in old.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def run_geometry(
@@ -77,14 +81,16 @@ def run_geometry(
             record = stage.step(step)
             finished = step + 1
             last = finished == total
+            stopped_by = request.name  # read once: a signal after this line stops the next step
+            saving = finished % config.output.checkpoint_every == 0 or last or stopped_by is not None
             values = dict(record.values)
-            if finished % _FIELD_CHECKED_EVERY == 0 or last or finished % config.output.checkpoint_every == 0:
+            if saving or finished % _FIELD_CHECKED_EVERY == 0:
                 values.update(stage.check_field(finished))
             recorder.row(finished, stage.phase_of(step)[0], values)
             every = config.output.sheet_every
             if len(record.pictures) and every and (finished % every == 0 or last):
                 recorder.sheet(finished, record)
-            if finished % config.output.checkpoint_every == 0 or last or request.name:
+            if saving:
                 save(finished)
-            if request.name and not last:
-                raise Interrupted(f"{request.name}: stopped after step {finished} of {total}; continue with --resume")
+            if stopped_by is not None:
+                raise Interrupted(f"{stopped_by}: stopped after step {finished} of {total}; continue with --resume")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
 from pathlib import Path
@@ -14,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from fd_mitsuba.training.checkpoint import write_atomically
 from fd_mitsuba.training.geometry_stage import StepRecord
 
 _SHOWN = ("loss_sds", "loss_focal", "loss_collision", "volume_ratio")
@@ -24,11 +26,14 @@ def read_metrics(path: Path) -> list[dict]:
     """The rows of a metrics file; a last line that a kill cut short is dropped."""
     rows = []
     if path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
-                rows.append(json.loads(line))
+                row = json.loads(line)
             except json.JSONDecodeError:
                 break
+            if not isinstance(row, dict):
+                break
+            rows.append(row)
     return rows
 
 
@@ -54,21 +59,29 @@ class Recorder:
         self._started = self._spoken = time.monotonic()
 
     def __enter__(self) -> Recorder:
-        kept = [row for row in read_metrics(self._path) if row.get("step", 0) <= self._done or row["stage"] != self._stage]
-        self._images.mkdir(parents=True, exist_ok=True)
-        self._file = open(self._path, "w", encoding="utf-8")  # noqa: SIM115 - closed in __exit__
-        self._file.writelines(json.dumps(row) + "\n" for row in kept)
-        self._file.flush()
+        rows = read_metrics(self._path)
+        kept = [row for row in rows if row.get("stage") != self._stage or row.get("step", 0) <= self._done]
+        # Renamed into place: a kill between emptying the file and writing it again would cost all rows.
+        write_atomically(self._path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+        self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115 - closed in __exit__
         if self._live:
             self._progress = Progress(
-                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),
-                TimeRemainingColumn(), TextColumn("{task.fields[values]}"), console=self._console,
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("ETA"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[values]}"),
+                console=self._console,
             )
             self._progress.start()
             self._task = self._progress.add_task(self._stage, total=self._total, completed=self._done, values="")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._progress is not None:
             self._progress.stop()
         if self._file is not None:
@@ -76,7 +89,12 @@ class Recorder:
 
     def row(self, step: int, phase: str, values: dict[str, float]) -> None:
         """Append one row to `metrics.jsonl` (`step` counts finished steps) and move the display on."""
-        row = {"stage": self._stage, "phase": phase, "step": step, "seconds": round(time.monotonic() - self._started, 3)}
+        row = {
+            "stage": self._stage,
+            "phase": phase,
+            "step": step,
+            "seconds": round(time.monotonic() - self._started, 3),
+        }
         assert self._file is not None
         self._file.write(json.dumps({**row, **{name: _short(value) for name, value in values.items()}}) + "\n")
         self._file.flush()
@@ -108,8 +126,16 @@ class Recorder:
             sheet = np.concatenate([sheet, below], axis=0)
         factor = max(1, round(512 / sheet.shape[1]))
         path = self._images / f"step_{step:06d}.png"
-        Image.fromarray(sheet).resize((sheet.shape[1] * factor, sheet.shape[0] * factor), Image.Resampling.NEAREST).save(path)
+        size = (sheet.shape[1] * factor, sheet.shape[0] * factor)
+        write_picture(path, Image.fromarray(sheet).resize(size, Image.Resampling.NEAREST))
         return path
+
+
+def write_picture(path: Path, image: Image.Image) -> None:
+    """Write a PNG, whole or not at all; UserError if the folder cannot be written."""
+    data = io.BytesIO()
+    image.save(data, format="PNG")
+    write_atomically(path, data.getvalue())
 
 
 def normal_pictures(pictures: torch.Tensor) -> np.ndarray:

@@ -1,0 +1,132 @@
+"""The run folder: whose it is, and what the run in it is made of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from importlib import metadata
+from pathlib import Path
+
+import torch
+
+from fd_mitsuba import __version__
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.training.checkpoint import is_litter, write_atomically
+
+_IDENTITY_NAME, _SETTINGS_NAME = "run.json", "config.json"
+
+
+def check_folder(scene: EditScene, config: RunConfig, folder: Path, resume: bool) -> None:
+    """Refuse a run folder that holds something else, or an interrupted run of other input or without `resume`.
+
+    What an interrupted write left behind does not count: a run that was killed in its first moment can start again.
+
+    Raises:
+        UserError: as above, or a file instead of a folder.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file; choose another -o folder")
+    if not folder.exists() or all(is_litter(path) for path in folder.iterdir()):
+        return
+    if not (folder / _IDENTITY_NAME).exists():
+        raise UserError(f"{folder}: not empty and not a run; choose another -o folder")
+    if not resume:
+        raise UserError(f"{folder}: holds a run already; add --resume to go on with it, or choose another -o folder")
+    _refuse_other_run(scene, config, folder)
+
+
+def describe_run(scene: EditScene, config: RunConfig, folder: Path, command: str) -> None:
+    """Make the run folder and write down what the run is made of: command, settings, environment, the scene's files.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    # The identity comes first: from then on the folder is a run's, whenever it is killed.
+    write_json(folder / _IDENTITY_NAME, _identity(scene, config))
+    for path in folder.rglob(".*"):
+        if is_litter(path):
+            path.unlink(missing_ok=True)
+    write_json(folder / _SETTINGS_NAME, config.model_dump(mode="json"))
+    write_json(folder / "environment.json", _environment())
+    commands = folder / "command.txt"
+    earlier = commands.read_text(encoding="utf-8", errors="replace") if commands.exists() else ""
+    write_atomically(commands, f"{earlier}{command}\n".encode())
+    _copy_scene(scene, folder / "scene")
+
+
+def write_json(path: Path, data: dict) -> None:
+    """Write indented JSON, whole or not at all; UserError if the folder cannot be written."""
+    write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
+
+
+def _identity(scene: EditScene, config: RunConfig) -> dict:
+    digest = hashlib.sha256()
+    for file in scene.files:
+        data = Path(file).read_bytes()
+        digest.update(f"{Path(file).name} {len(data)}\n".encode() + data)
+    return {
+        "scene": str(scene.path.resolve()),
+        "scene_hash": digest.hexdigest()[:16],
+        "prompt": scene.prompt,
+        "parameters": scene.parameters,
+        "config_hash": config.content_hash(),
+    }
+
+
+def _refuse_other_run(scene: EditScene, config: RunConfig, folder: Path) -> None:
+    known, now = _read_json(folder / _IDENTITY_NAME), _identity(scene, config)
+    remedy = "resume with the run's own scene, --prompt, -c, --set and -D, or choose another -o folder"
+    for key in ("prompt", "parameters"):
+        if known.get(key) != now[key]:
+            raise UserError(f"{folder}: holds a run with other {key} ({known.get(key)!r}, now {now[key]!r}); {remedy}")
+    if known.get("scene_hash") != now["scene_hash"]:
+        raise UserError(f"{folder}: holds a run of another scene, or a file of the scene was changed since; {remedy}")
+    if known.get("config_hash") != now["config_hash"]:
+        before, after = _flat(_read_json(folder / _SETTINGS_NAME)), _flat(config.model_dump(mode="json"))
+        changed = [
+            f"{key} = {before.get(key)}, now {value}" for key, value in after.items() if before.get(key) != value
+        ]
+        raise UserError(f"{folder}: holds a run with other settings ({'; '.join(changed[:3]) or 'unknown'}); {remedy}")
+
+
+def _flat(settings: dict) -> dict:
+    sections = {k: v for k, v in settings.items() if isinstance(v, dict)}
+    inner = {f"{section}.{key}": value for section, values in sections.items() for key, value in values.items()}
+    return {k: v for k, v in settings.items() if k not in sections} | inner
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        data = None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: cannot be read, so the run cannot be resumed; choose another -o folder")
+    return data
+
+
+def _copy_scene(scene: EditScene, folder: Path) -> None:
+    """Copies of every file that the scene reads, for the record; the run itself reads the originals.
+
+    What lies below the scene's folder keeps its place, the rest goes with its whole path below `elsewhere`.
+    """
+    root = scene.path.resolve().parent
+    for file in scene.files:
+        source = Path(file).resolve()
+        place = source.relative_to(root) if source.is_relative_to(root) else Path("elsewhere", *source.parts[1:])
+        if not (folder / place).exists():
+            write_atomically(folder / place, source.read_bytes())
+
+
+def _environment() -> dict[str, str | int]:
+    names = ("mitsuba", "drjit", "torch", "diffusers", "transformers", "numpy", "libigl")
+    return {
+        "fd_mitsuba": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": torch.get_num_threads(),
+        **{name: metadata.version(name) for name in names},
+    }

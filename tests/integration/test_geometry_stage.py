@@ -1,0 +1,103 @@
+"""Behaviour of the geometry stage with a guidance that is known in closed form: a target picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import RunStopped
+from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
+from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.training.geometry_stage import GeometryStage
+
+
+class PullMask:
+    """Asks for as much (sign +1) or as little (-1) of the part in the pictures as possible."""
+
+    needs_base = False
+    view_grid = 1
+    normal_space = None
+
+    def __init__(self, sign: float) -> None:
+        self.sign = sign
+
+    def picture_size(self, phase: str) -> int:
+        return 24
+
+    def set_prompt(self, prompt: str, negative_prompt: str = "") -> list[str]:
+        return []
+
+    def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: str, seed: int) -> GuidanceResult:
+        return GuidanceResult(-self.sign * views.pictures[:, 3].sum())
+
+
+def settings(**geometry: float) -> RunConfig:
+    values = {"steps": 20, "grid_resolution": 20, "views": 2, "spp": 2, "learning_rate": 5e-3, "focal_samples": 500}
+    return RunConfig.model_validate(
+        {"geometry": {**values, **geometry}, "field": {"levels": 4, "finest_resolution": 16, "log2_table": 12}}
+    )
+
+
+@pytest.fixture
+def stage(make_scene: Callable[..., Path]) -> Callable[..., GeometryStage]:
+    def make(sign: float, **geometry: float) -> GeometryStage:
+        return GeometryStage(load_edit_scene(make_scene()), settings(**geometry), PullMask(sign))
+
+    return make
+
+
+def test_the_loss_falls(stage: Callable[..., GeometryStage]) -> None:
+    grower = stage(+1.0, lambda_focal=0.0, lambda_collision=0.0)
+    first = grower.check_field(0)["volume_ratio"]
+    for step in range(20):
+        grower.step(step)
+    assert grower.check_field(20)["volume_ratio"] > 1.2 * first
+
+
+def test_the_focal_loss_keeps_the_part_in_its_region(stage: Callable[..., GeometryStage]) -> None:
+    free, held = stage(+1.0, lambda_focal=0.0), stage(+1.0, lambda_focal=1e6)
+    for step in range(20):
+        free.step(step)
+        held.step(step)
+
+    def leaked(stage: GeometryStage) -> int:
+        sdf, region = stage.extractor.part_sdf(stage.field), stage.region_sdf[stage.extractor.active_index]
+        return int(((sdf > 0) & (region < -stage.config.geometry.focal_band)).sum())
+
+    assert leaked(free) > 10 * max(leaked(held), 1)
+
+
+def test_zero_weights_turn_the_work_off(stage: Callable[..., GeometryStage]) -> None:
+    off = stage(+1.0, lambda_focal=0.0, lambda_collision=0.0).step(0).values
+    assert "loss_focal" not in off and "loss_collision" not in off
+    no_image = stage(+1.0, lambda_sds=0.0).step(0)
+    assert "loss_sds" not in no_image.values and len(no_image.pictures) == 0
+
+
+def test_same_seed_same_field(stage: Callable[..., GeometryStage]) -> None:
+    first, second = stage(+1.0), stage(+1.0)
+    for step in range(3):
+        first.step(step)
+        second.step(step)
+    for one, other in zip(first.field.parameters(), second.field.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_a_part_that_vanishes_stops_the_run(stage: Callable[..., GeometryStage]) -> None:
+    shrinker = stage(-1.0, learning_rate=5e-2, lambda_focal=0.0)
+    with pytest.raises(RunStopped, match="vanished|invisible|exploded"):
+        for step in range(60):
+            shrinker.step(step)
+            shrinker.check_field(step)
+
+
+def test_a_field_that_is_not_finite_stops_the_run(stage: Callable[..., GeometryStage]) -> None:
+    broken = stage(+1.0)
+    with torch.no_grad():
+        next(broken.field.parameters()).fill_(float("nan"))
+    with pytest.raises(RunStopped, match="not finite"):
+        broken.check_field(7)
