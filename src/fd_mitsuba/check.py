@@ -19,7 +19,8 @@ from fd_mitsuba.scene.triangle_mesh import Topology, topology
 THINNEST_IN_CELLS = 3.0
 """A region thinner than this many cells of the grid loses its shape in the marching tetrahedra."""
 
-_REACH = 0.1  # beyond its regions and the free band a part is still evaluated this far, in canonical units
+_REACH = 0.15
+"""How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
 
 
 @dataclass(frozen=True)
@@ -146,25 +147,36 @@ def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell:
 
 
 def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
-    """A rough forecast of a geometry run's time and memory, by counting what a step touches."""
+    """A rough forecast of a geometry run's time and memory, by counting what a step touches.
+
+        step = fixed + field (active vertices) + surface (faces) + rays + guidance (forward passes of the network)
+
+    The constants are fitted to `benchmarks/geometry_step.py` with 2 cores, no GPU: 0.115 s a step on the pegasus
+    scene's default grid (15k active vertices, 36k faces, 82k rays) and 0.24 s on the grid of 128 cells a side (123k
+    active vertices, 145k faces). The built-in prior takes 0.06 s for each pass over four views, so that a step of
+    `configs/quick.toml` comes to 0.2 s; it was measured at 0.20 to 0.26 s, and at 0.36 s beside another busy process.
+    """
     geometry, guidance = config.geometry, config.guidance
     axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
     lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    share = float(np.mean(union_sdf(scene.regions, lattice) > -(geometry.focal_band + _REACH)))
+    share = float(np.mean(union_sdf(scene.regions, lattice) > -_REACH))
     vertices = (geometry.grid_resolution + 1) ** 3
     active = round(share * vertices)
 
     queries = active + geometry.focal_samples
-    field = 2.5e-7 * config.field.levels * queries
-    surface = 6e-8 * vertices
-    render = 0.02 + 0.012 * geometry.views * (geometry.spp + 4 * geometry.silhouette_spp) / 8
-    passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
+    field = 3.5e-8 * config.field.levels * queries
+    surface = 8e-7 * 8.6 * vertices ** (2 / 3)
+    side = 32 if guidance.model == "builtin" else 64
+    rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
     weights, source = _unet_weights(guidance.model)
-    # A UNet of the Stable Diffusion layout spends about 800 operations a weight at a 64x64 latent.
-    forward = 800.0 * weights / 6e10
-    step = field + surface + render + passes * forward
+    passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
+    if guidance.model == "builtin":
+        forward = 0.06 / 4  # four views are one picture to it
+    else:
+        forward = 800.0 * weights / 6e10  # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent
+    step = 0.03 + field + surface + rays + passes * forward
     assumptions = (
-        "2 cores of about 60 GFLOP/s together and 4 views at the size of the latent",
+        "2 cores of about 60 GFLOP/s together, otherwise idle, and views at the size of the latent",
         f"a UNet of {weights / 1e6:.3g} million weights ({source})",
         f"{queries} queries of the part's field a step",
     )
@@ -179,7 +191,7 @@ def _unet_weights(model: str) -> tuple[float, str]:
         size = max(file.stat().st_size for file in files)
         return size / (2 if ".fp16." in files[0].name else 4), f"from {folder}"
     if model == "builtin":
-        return 8e6, "the built-in prior"
+        return 7.0e6, "the built-in prior"
     return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"
 
 

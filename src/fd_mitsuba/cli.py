@@ -203,13 +203,9 @@ def _load(options: argparse.Namespace):
         warnings.filterwarnings("ignore")
         os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
         os.environ.setdefault("DIFFUSERS_VERBOSITY", "error")
-    from fd_mitsuba.mitsuba_api import start
+    from fd_mitsuba.threads import share_cores
 
-    start(options.variant, options.threads)
-    if options.threads:
-        import torch
-
-        torch.set_num_threads(options.threads)
+    share_cores(options.threads, options.variant)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
     return load_edit_scene(options.scene, parameters)

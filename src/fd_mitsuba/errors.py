@@ -11,7 +11,7 @@ class UserError(Exception):
 
 
 class RunStopped(UserError):
-    """A run that cannot go on (the part vanished, a NaN, an exploding field): says why and what was kept. Exit code 1."""
+    """A run that cannot go on (the part vanished, a NaN, an exploding field): says why. Exit code 1."""
 
 
 class Interrupted(Exception):

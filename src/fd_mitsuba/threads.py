@@ -1,19 +1,68 @@
-"""How torch and Dr.Jit share the processor's cores."""
+"""How the renderer and torch share the processor's cores: decided in one place, before a run starts.
+
+Both keep a pool of threads of their own, and a step hands over between them a few hundred times. Threads that wait by
+spinning then take the core that the other pool needs: with both pools on two cores a step takes several times as long
+as with one thread each. So
+
+* OpenMP's idle threads sleep (`OMP_WAIT_POLICY=PASSIVE`, which counts only if it is set before torch is loaded);
+* torch runs the small operations of a geometry step on one thread, and takes more only inside `network_threads()`,
+  around a diffusion model;
+* Dr.Jit stays on one thread where there are at most two cores: a second one made a quiet machine's step a fifth faster,
+  but two to three times as slow as soon as anything else ran. With more cores it leaves one to the rest.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from fd_mitsuba.mitsuba_api import DEFAULT_VARIANT, start
+
+_FEW_CORES = 2
+_network_threads: int | None = None
 
 
-def share_cores(threads: int = 0) -> None:
-    spin = os.environ.get("X_SPIN")
-    if spin:
-        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    from fd_mitsuba.mitsuba_api import start
+def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
+    """Start Mitsuba and set all thread counts. Call once per process, before anything imports torch.
 
-    start(threads=int(os.environ.get("X_DR", "0")))
+    Args:
+        threads: cores to use; 0: all that this process may run on. 1 gives every pool one thread, and so results that
+            are the same bytes at every run.
+        variant: Mitsuba's variant.
+
+    Raises:
+        UserError: as `mitsuba_api.start`.
+    """
+    global _network_threads
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    cores = threads or available_cores()
+    start(variant, threads if threads < 0 else renderer_threads(cores))
     import torch
 
-    t = int(os.environ.get("X_TORCH", "0"))
-    if t:
-        torch.set_num_threads(t)
+    torch.set_num_threads(1)
+    _network_threads = cores
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def renderer_threads(cores: int) -> int:
+    """Dr.Jit's share of `cores`."""
+    return 1 if cores <= _FEW_CORES else cores - 1
+
+
+@contextmanager
+def network_threads() -> Iterator[None]:
+    """While open, torch uses all the cores given to `share_cores`; without that call nothing changes."""
+    import torch
+
+    before = torch.get_num_threads()
+    if _network_threads is not None:
+        torch.set_num_threads(_network_threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""The gradient of a picture's loss through render, marching tetrahedra, union and network, against finite differences."""
+"""The gradient of a picture through render, marching tetrahedra, union and network, against finite differences."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def chain() -> tuple:
     cameras = CameraBatch.around(np.array([20.0, 200.0]), 20.0, 3.0, 45.0)
     ramp = np.linspace(-1, 1, SIZE, dtype=np.float32)
     weights = torch.from_numpy(
-        np.stack([np.outer(ramp, np.ones(SIZE)), np.outer(np.ones(SIZE), ramp), np.ones((SIZE, SIZE)), np.outer(ramp, ramp)])
+        np.stack(
+            [np.outer(ramp, np.ones(SIZE)), np.outer(np.ones(SIZE), ramp), np.ones((SIZE, SIZE)), np.outer(ramp, ramp)]
+        )
     ).float()
     return extractor, field, cameras, weights
 

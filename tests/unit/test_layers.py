@@ -11,7 +11,7 @@ import fd_mitsuba
 
 ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
-    "conventions errors config mitsuba_api scene fields extraction render guidance losses training export evaluation "
+    "conventions errors config mitsuba_api threads scene fields extraction render guidance losses training export evaluation "
     "prior check preview doctor pipeline cli __main__"
 ).split()
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -28,7 +28,7 @@ def measure_locality(
     base: tuple[np.ndarray, np.ndarray],
     regions: tuple[FocalRegion, ...],
     band: float,
-    samples: int = 96,
+    samples: int = 64,
 ) -> Locality:
     """Counts of a regular lattice over the part's bounding box, `samples` points along its longest side.
 

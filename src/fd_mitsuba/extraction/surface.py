@@ -286,7 +286,7 @@ class SurfaceExtractor:
 
 
 def _faces_of_part(part_weight: Tensor, faces: Tensor) -> Tensor:
-    return part_weight.detach()[faces].mean(dim=1) > 0.5
+    return part_weight.detach().index_select(0, faces.view(-1)).view(-1, 3).sum(dim=1) > 1.5
 
 
 def _away_from_surface(sdf: Tensor) -> Tensor:

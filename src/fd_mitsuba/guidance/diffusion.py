@@ -21,6 +21,7 @@ from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
+from fd_mitsuba.threads import network_threads
 
 RECONSTRUCTION_STEPS = 4
 """DDIM steps from z_t down to the clean latents, for the variant `reconstruction`."""
@@ -94,6 +95,7 @@ class DiffusionGuidance:
             for azimuth in list(views.azimuth_deg)[:: self.view_grid**2]
         ]
 
+    @network_threads()
     def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: Phase, seed: int) -> GuidanceResult:
         """The loss whose gradient is the mean over pictures (mosaics) of the guidance gradient summed over latents.
 

@@ -1,4 +1,4 @@
-"""The built-in prior's networks, in the layout of an InstructPix2Pix pipeline: tokenizer, text encoder, UNet, VAE, scheduler."""
+"""The built-in prior's networks, in the layout of an InstructPix2Pix pipeline."""
 
 from __future__ import annotations
 

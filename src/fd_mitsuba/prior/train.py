@@ -19,6 +19,11 @@ from fd_mitsuba.prior.parts import PARTS
 CHANGED_WEIGHT = 4.0
 """Extra loss weight of pixels where the part is: they are few, and the rest is a copy."""
 
+OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
+"""Bodies that most pictures show; the others keep the copying of the base general."""
+_BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
+_BODY_SHARES /= _BODY_SHARES.sum()
+
 
 class Pool:
     """The most recent pairs; every call to `refresh` renders one more body with a few of its parts."""
@@ -31,7 +36,7 @@ class Pool:
         """Render until `count` more pairs are there."""
         goal = count
         while goal > 0:
-            body = list(BODIES)[self._rng.integers(len(BODIES))]
+            body = str(self._rng.choice(list(BODIES), p=_BODY_SHARES))
             parts: list[str | None] = list(self._rng.permutation(list(PARTS))[:4])
             if self._rng.random() < 0.15:
                 parts.append(None)

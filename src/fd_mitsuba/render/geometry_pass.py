@@ -91,7 +91,8 @@ class GeometryPass:
             surface = ShadedMesh.create(positions, upload_indices(mesh.faces), weights)
             picture = self._interior(surface, views, self.spp, seed)
             if wanted:
-                outline = self._silhouettes.outline(mesh.vertices, mesh.faces, views, mesh.static_faces)
+                uploaded = (dr.detach(positions), surface.faces)
+                outline = self._silhouettes.outline(mesh.vertices, mesh.faces, views, mesh.static_faces, uploaded)
                 points = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
                 add_boundary_term(picture, surface, self._tracer, views, points, self.normal_space)
             return _join(picture)

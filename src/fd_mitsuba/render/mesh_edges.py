@@ -31,8 +31,13 @@ class MeshEdges:
 
 def corners(faces: np.ndarray, half_edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertex indices of half-edges: where each starts, where it ends, and the face's third vertex."""
-    face, corner = np.divmod(half_edges, 3)
-    return faces[face, corner], faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
+    flat, corner = faces.reshape(-1), half_edges % 3
+    start, end = _ends(flat, half_edges, corner)
+    return start, end, flat[half_edges + np.where(corner == 0, 2, -1)]
+
+
+def _ends(flat: np.ndarray, half_edges: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return flat[half_edges], flat[half_edges + np.where(corner == 2, -2, 1)]
 
 
 def pair_half_edges(faces: np.ndarray, half_edges: np.ndarray | None = None) -> MeshEdges:
@@ -49,19 +54,26 @@ def pair_half_edges(faces: np.ndarray, half_edges: np.ndarray | None = None) -> 
         half_edges = np.arange(count, dtype=np.int64)
         start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
     else:
-        start, end, _ = corners(faces, half_edges)
+        start, end = _ends(faces.reshape(-1), half_edges, half_edges % 3)
     if not len(half_edges):
         return MeshEdges(np.zeros(0, np.int64), np.zeros(0, np.int64))
     vertex_count = int(faces.max()) + 1
     low_bits = max(count - 1, 1).bit_length()
-    edge = np.minimum(start, end).astype(np.int64) * vertex_count + np.maximum(start, end)
+    edge = np.minimum(start, end).astype(np.int64, copy=False)
+    edge *= vertex_count
+    edge += np.maximum(start, end)
     if (vertex_count * vertex_count).bit_length() + low_bits <= 63:
         # Edge and half-edge in one number: a plain sort is several times faster than an argsort.
-        packed = np.sort((edge << low_bits) | half_edges)
-        edge, half_edges = packed >> low_bits, packed & ((1 << low_bits) - 1)
+        edge <<= low_bits
+        edge |= half_edges
+        edge.sort()
+        half_edges = edge & ((1 << low_bits) - 1)
+        edge >>= low_bits
     else:
         order = np.argsort(edge, kind="stable")
         edge, half_edges = edge[order], half_edges[order]
+    if len(edge) % 2 == 0 and np.array_equal(edge[::2], edge[1::2]) and (edge[2::2] != edge[1:-1:2]).all():
+        return MeshEdges(half_edges[::2], half_edges[1::2])  # closed and manifold: the same as below, sooner
     joined = np.append(edge[1:] == edge[:-1], False)  # this one and the next
     begins = np.flatnonzero(np.append(True, ~joined[:-1]))
     place = np.arange(len(edge)) - np.repeat(begins, np.diff(np.append(begins, len(edge))))
@@ -100,10 +112,10 @@ def check_welded(faces: np.ndarray, edges: MeshEdges) -> None:
         ValueError: most edges have one face only (vertices not welded), or neighbours disagree about the outside.
     """
     closed = edges.half_b >= 0
-    if len(faces) >= 100 and closed.mean() < 0.5:
-        raise ValueError(f"{int((~closed).sum())} of {len(closed)} edges have one face only: weld the mesh's vertices")
-    starts = faces.reshape(-1)
-    start_a, start_b = starts[edges.half_a[closed]], starts[edges.half_b[closed]]
-    against = int((start_a == start_b).sum())
-    if against > 0.01 * len(start_a):
-        raise ValueError(f"{against} of {len(start_a)} edges join faces of opposite winding: orient the mesh")
+    count = int(closed.sum())
+    if len(faces) >= 100 and count < 0.5 * len(closed):
+        raise ValueError(f"{len(closed) - count} of {len(closed)} edges have one face only: weld the mesh's vertices")
+    starts = faces.reshape(-1)  # a boundary edge's -1 reads some vertex, which does not count
+    against = int((closed & (starts[edges.half_a] == starts[edges.half_b])).sum())
+    if against > 0.01 * count:
+        raise ValueError(f"{against} of {count} edges join faces of opposite winding: orient the mesh")

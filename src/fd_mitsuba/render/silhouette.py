@@ -22,12 +22,20 @@ class SilhouetteFinder:
         self._cache = EdgeCache()
         self._fixed: tuple[MeshEdges, mi.UInt32, mi.UInt32] | None = None
 
-    def outline(self, vertices: np.ndarray, faces: np.ndarray, cameras: FilmCameras, static_faces: int = 0) -> Outline:
+    def outline(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        cameras: FilmCameras,
+        static_faces: int = 0,
+        uploaded: tuple[mi.Float, mi.UInt32] | None = None,
+    ) -> Outline:
         """The silhouette edges of all views, within the picture. Concave folds are left out: the surface hides them.
 
         Args:
             vertices: (V, 3) float32.
             faces: (F, 3) int64, welded, outward winding.
+            uploaded: flat vertices and faces in Dr.Jit, detached, where the caller has them already.
 
         Raises:
             ValueError: vertices not welded, or winding not consistent.
@@ -37,10 +45,12 @@ class SilhouetteFinder:
         if self._fixed is None or self._fixed[0] is not fixed:
             self._fixed = (fixed, upload_indices(fixed.face_a), upload_indices(fixed.face_b))
         edge_sets = (self._fixed, (moving, upload_indices(moving.face_a), upload_indices(moving.face_b)))
+        if uploaded is None:
+            uploaded = (upload_floats(vertices), upload_indices(faces))
         parts = []
         for begin in range(0, cameras.count, _VIEWS_AT_ONCE):
             eyes = cameras.position[begin : begin + _VIEWS_AT_ONCE]
-            facing = _facing(vertices, faces, eyes)
+            facing = _facing(*uploaded, eyes)
             for edges, face_a, face_b in edge_sets:
                 if len(edges.half_a):
                     edge, view = _turning(facing, face_a, face_b, len(eyes))
@@ -51,10 +61,9 @@ class SilhouetteFinder:
         return clip_outline(*_convex(vertices, faces, view, half_a, half_b), vertices, cameras)
 
 
-def _facing(vertices: np.ndarray, faces: np.ndarray, eyes: np.ndarray) -> mi.UInt32:
+def _facing(positions: mi.Float, triangles: mi.UInt32, eyes: np.ndarray) -> mi.UInt32:
     """One number a face: bit b says whether it is turned to the eye b of at most 32."""
-    positions, triangles = upload_floats(vertices), upload_indices(faces)
-    triangle = dr.gather(mi.Vector3u, triangles, dr.arange(mi.UInt32, len(faces)))
+    triangle = dr.gather(mi.Vector3u, triangles, dr.arange(mi.UInt32, dr.width(triangles) // 3))
     a, b, c = (dr.gather(mi.Point3f, positions, triangle[k]) for k in range(3))
     normal = dr.cross(b - a, c - a)
     places = upload_floats(eyes)

@@ -1,0 +1,137 @@
+"""Settings: what is accepted, what is refused in one line, and what changes the hash."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.errors import UserError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def refusal(path: Path | None = None, *overrides: str) -> str:
+    with pytest.raises(UserError) as caught:
+        load_config(path, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_defaults_are_the_papers() -> None:
+    config = load_config(None)
+    assert config == RunConfig()
+    geometry = config.geometry
+    assert (geometry.steps, geometry.learning_rate, geometry.union_k, geometry.views) == (3000, 1e-3, 0.15, 4)
+    assert config.guidance.guidance_scale == 100.0
+
+
+@pytest.mark.parametrize("name", ["paper", "quick", "smoke"])
+def test_shipped_files_are_valid(name: str) -> None:
+    load_config(ROOT / "configs" / f"{name}.toml")
+
+
+def test_file_and_overrides(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("seed = 3\n[geometry]\nsteps = 7\nviews = 2\n")
+    config = load_config(path, ["geometry.steps=9", "cameras.fov_deg=[40, 41]", "guidance.model=a/b", "seed=5"])
+    assert (config.geometry.steps, config.geometry.views, config.seed) == (9, 2, 5)
+    assert config.cameras.fov_deg == (40.0, 41.0) and config.guidance.model == "a/b"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("sd 2=1/x", "sd 2=1/x"), ('"1"', "1"), ("true story", "true story"), ("", "")],
+)
+def test_text_that_is_not_toml_stays_text(text: str, value: str) -> None:
+    assert load_config(None, [f"guidance.model={text}"]).guidance.model == value
+
+
+def test_missing_file() -> None:
+    assert "nowhere.toml: no such config file" in refusal(Path("nowhere.toml"))
+
+
+@pytest.mark.parametrize("content", [b"steps = ", b"[geometry\nsteps = 3", b"a = 1\na = 2\n", b"\xff\xfe\x00bad"])
+def test_broken_file(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.toml"
+    path.write_bytes(content)
+    assert str(path) in refusal(path)
+
+
+def test_folder_instead_of_a_file(tmp_path: Path) -> None:
+    assert "cannot be read" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "nearest"),
+    [("geometry.step=3", "geometry.steps"), ("geometri.steps=3", "geometry"), ("sed=3", "seed")],
+)
+def test_unknown_key_names_the_nearest(override: str, nearest: str) -> None:
+    message = refusal(None, override)
+    assert "unknown key" in message and nearest in message
+
+
+def test_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("[output]\nshet_every = 3\n")
+    message = refusal(path)
+    assert str(path) in message and "output.sheet_every" in message
+
+
+@pytest.mark.parametrize("override", ["geometry.steps", "=3", "geometry.steps.more.x", ""])
+def test_override_that_is_none(override: str) -> None:
+    assert "section.key=value" in refusal(None, override)
+
+
+def test_override_below_a_value() -> None:
+    assert "is a value, not a section" in refusal(None, "seed=1", "seed.x=2")
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "geometry.lambda_focal=-1",
+        "geometry.lambda_sds=nan",
+        "geometry.learning_rate=inf",
+        "geometry.learning_rate=0",
+        "geometry.learning_rate=fast",
+        "geometry.steps=0",
+        "geometry.steps=2.5",
+        "geometry.grid_resolution=4",
+        "geometry.grid_resolution=1000",
+        "geometry.coarse_fraction=1.5",
+        "geometry.betas=[0.9, 1.0]",
+        "geometry.normal_space=object",
+        "geometry=3",
+        "guidance.timestep_range_coarse=[0.5, 0.2]",
+        "guidance.timestep_range_refined=[0.5, 1.2]",
+        "guidance.timestep_range_refined=[0.5]",
+        "guidance.timestep_range_coarse=[nan, 0.5]",
+        "guidance.dtype=float8",
+        "cameras.fov_deg=[0, 40]",
+        "cameras.elevation_deg=[-100, 0]",
+        "output.checkpoint_every=0",
+        "output.checkpoints_kept=0",
+        "seed=-1",
+        "seed=1e10",
+    ],
+)
+def test_values_out_of_range(override: str) -> None:
+    message = refusal(None, override)
+    assert override.partition("=")[0].split(".")[0] in message
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        RunConfig().geometry.steps = 3  # type: ignore[misc]
+
+
+def test_hash_follows_every_setting() -> None:
+    overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "output.sheet_every=3", "cameras.aim=object"]
+    hashes = [load_config(None, [override]).content_hash() for override in overrides]
+    assert len({RunConfig().content_hash(), *hashes}) == len(overrides) + 1
+    assert load_config(None, ["geometry.steps=3000"]).content_hash() == RunConfig().content_hash()
+    assert RunConfig.model_validate(RunConfig().model_dump(mode="json")).content_hash() == RunConfig().content_hash()

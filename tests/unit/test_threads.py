@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from fd_mitsuba import threads
+
+
+def test_the_network_gets_the_cores_and_gives_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = torch.get_num_threads()
+    with threads.network_threads():
+        assert torch.get_num_threads() == before  # nobody shared the cores yet
+    monkeypatch.setattr(threads, "_network_threads", before + 1)
+    with pytest.raises(KeyError), threads.network_threads():
+        assert torch.get_num_threads() == before + 1
+        raise KeyError
+    assert torch.get_num_threads() == before
+
+
+def test_the_renderer_shares_only_where_there_are_cores_to_spare() -> None:
+    assert [threads.renderer_threads(cores) for cores in (1, 2, 3, 8)] == [1, 1, 2, 7]
+
+
+@pytest.mark.parametrize(("given", "network", "renderer"), [(1, 1, 1), (3, 3, 2)])
+def test_a_process_starts_with_the_shares(given: int, network: int, renderer: int) -> None:
+    script = f"""
+import sys
+from fd_mitsuba.threads import network_threads, share_cores
+assert "torch" not in sys.modules
+share_cores({given})
+import os, drjit, torch
+with network_threads():
+    inside = torch.get_num_threads()
+print(os.environ["OMP_WAIT_POLICY"], torch.get_num_threads(), inside, drjit.thread_count())
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment.pop("OMP_WAIT_POLICY", None)
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["PASSIVE", "1", str(network), str(renderer)], done.stderr
