@@ -91,9 +91,21 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument("--json", action="store_true")
     doctor.set_defaults(call=_doctor)
 
-    prior = commands.add_parser("prior", help="the words that the built-in prior knows")
+    prior = commands.add_parser("prior", help="the words that the built-in prior knows; train and pack a new one")
     prior.add_argument("--json", action="store_true")
     prior.set_defaults(call=_prior)
+    actions = prior.add_subparsers(dest="action", metavar="ACTION")
+    train = actions.add_parser("train", help="train on fresh pictures; goes on where the folder's checkpoint ends")
+    train.add_argument("-o", "--output", default="work/prior", metavar="FOLDER", help="checkpoint and log")
+    train.add_argument("--steps", type=int, default=4000, help="length of the schedule")
+    train.add_argument("--hours", type=float, default=8.0, help="stop after this time at the latest")
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("-t", "--threads", type=int, default=0, metavar="N")
+    train.set_defaults(call=_prior_train)
+    pack = actions.add_parser("pack", help="write a checkpoint as a pipeline folder")
+    pack.add_argument("checkpoint", help="checkpoint.pt of a training")
+    pack.add_argument("-o", "--output", required=True, metavar="FOLDER")
+    pack.set_defaults(call=_prior_pack)
     return parser
 
 
@@ -187,6 +199,28 @@ def _prior(options: argparse.Namespace) -> int:
 
 def _remark(line: str) -> None:
     print(f"fd_mitsuba: {line}", file=sys.stderr)
+
+
+def _prior_train(options: argparse.Namespace) -> int:
+    from fd_mitsuba.threads import network_threads, share_cores
+
+    share_cores(options.threads)
+    from fd_mitsuba.prior.train import train
+
+    with network_threads():
+        train(Path(options.output), options.hours * 3600, total_steps=options.steps, seed=options.seed)
+    print(f"{options.output}: checkpoint.pt and log.jsonl")
+    return 0
+
+
+def _prior_pack(options: argparse.Namespace) -> int:
+    from fd_mitsuba.prior.pack import pack
+
+    if not Path(options.checkpoint).is_file():
+        raise UserError(f"{options.checkpoint}: no such checkpoint; make one with fd_mitsuba prior train")
+    pack(Path(options.checkpoint), Path(options.output))
+    print(options.output)
+    return 0
 
 
 def _load(options: argparse.Namespace):

@@ -132,17 +132,18 @@ class SurfaceExtractor:
         union = soft_union(self._site_base, sdf_part, self.union_k, self.union_only_outside)
         edges, faces = self._crossings(union > 0)
         lower, upper = edge_ends(edges, self._box.shape)
-        fixed = (self._box_site[lower] < 0) & (self._box_site[upper] < 0)
+        is_fixed = (self._box_site.index_select(0, lower) < 0) & (self._box_site.index_select(0, upper) < 0)
+        fixed, free = true_positions(is_fixed), true_positions(~is_fixed)
         places = torch.empty(len(edges), dtype=torch.int64)
         places[fixed] = torch.searchsorted(self._static_edges, self._box.grid_edges(edges[fixed]))
-        lower, upper = lower[~fixed], upper[~fixed]
-        places[~fixed] = torch.arange(len(lower)) + len(self._static_edges)
+        lower, upper = lower.index_select(0, free), upper.index_select(0, free)
+        places[free] = torch.arange(len(lower)) + len(self._static_edges)
 
         ends, position = self._box.unique(torch.cat([lower, upper]))
         values, end_sites, sample_sdf = self._values_with_gradient(field, sites, features, ends, samples)
         vertices, part_weight = self._surface_vertices(ends, values, end_sites, position.view(2, -1))
         part_weight = torch.cat([part_weight.new_zeros(len(self._static_vertices)), part_weight])
-        faces = places[faces]
+        faces = places.index_select(0, faces.view(-1)).view(-1, 3)
         is_part = torch.cat([self._static_is_part, _faces_of_part(part_weight, faces)])
         vertices = torch.cat([self._static_vertices, vertices])
         return UnionSurface(vertices, torch.cat([self._static_faces, faces]), part_weight, is_part, sample_sdf)

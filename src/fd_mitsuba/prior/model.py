@@ -18,7 +18,7 @@ LATENT_SIZE = 64
 
 
 def build_tokenizer() -> PreTrainedTokenizerFast:
-    """A CLIP-format byte-pair tokenizer in which every word of the captions is a single token."""
+    """A CLIP-format byte-pair tokenizer in which every word of the captions is a single token; see `tokenizer_of`."""
     begin, end = "<|startoftext|>", "<|endoftext|>"
     tokenizer = Tokenizer(models.BPE(unk_token=end, end_of_word_suffix="</w>", fuse_unk=False))
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
@@ -47,6 +47,17 @@ def build_tokenizer() -> PreTrainedTokenizerFast:
         unk_token=end,
         model_max_length=TEXT_LENGTH,
     )
+
+
+def tokenizer_of(folder: Path) -> PreTrainedTokenizerFast:
+    """The tokenizer that belongs to a training folder: made and saved there at the first call, read at every other.
+
+    The trainer of `tokenizers` numbers short tokens in the order of a hash table, so weights fit one build only.
+    """
+    path = folder / "tokenizer"
+    if not (path / "tokenizer.json").exists():
+        build_tokenizer().save_pretrained(path)
+    return PreTrainedTokenizerFast.from_pretrained(str(path), local_files_only=True)
 
 
 def build_text_encoder(tokenizer: PreTrainedTokenizerFast) -> CLIPTextModel:

@@ -10,7 +10,7 @@ import diffusers
 import torch
 
 from fd_mitsuba.guidance.builtin import SUMS_NAME
-from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_tokenizer, build_unet, save_conventions
+from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_unet, save_conventions, tokenizer_of
 from fd_mitsuba.prior.vae import build_vae
 
 
@@ -18,11 +18,11 @@ def pack(checkpoint: Path, folder: Path) -> None:
     """Write the averaged weights of a checkpoint as an InstructPix2Pix-layout pipeline folder.
 
     Args:
-        checkpoint: `checkpoint.pt` of `prior.train.train`.
+        checkpoint: `checkpoint.pt` of `prior.train.train`, in its training folder.
         folder: created; existing files are replaced.
     """
     average = torch.load(checkpoint, weights_only=True)["average"]
-    tokenizer = build_tokenizer()
+    tokenizer = tokenizer_of(checkpoint.parent)
     modules = torch.nn.ModuleDict({"text_encoder": build_text_encoder(tokenizer), "unet": build_unet()})
     missing = modules.load_state_dict(average, strict=False).missing_keys
     if any("position_ids" not in key for key in missing):

@@ -13,7 +13,7 @@ import torch
 
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.corpus import Pair, make_pairs
-from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_tokenizer, build_unet, encode_text
+from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_unet, encode_text, tokenizer_of
 from fd_mitsuba.prior.parts import PARTS
 
 CHANGED_WEIGHT = 4.0
@@ -70,7 +70,7 @@ def train(
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
-    tokenizer = build_tokenizer()
+    tokenizer = tokenizer_of(folder)
     encoder, unet, scheduler = (
         build_text_encoder(tokenizer),
         build_unet().to(memory_format=torch.channels_last),

@@ -44,9 +44,12 @@ def clip_outline(
         opposite: (S,) another vertex of a face beside it, which tells on which side of the edge the surface lies.
         vertices: (V, 3) float32.
     """
-    axes, origin, half_width = cameras.axes[view], cameras.position[view], cameras.half_width[view]
-    ends = np.einsum("nij,nkj->nki", axes, vertices[pair].astype(np.float64) - origin[:, None])  # camera space, z back
-    third = np.einsum("nij,nj->ni", axes, vertices[opposite].astype(np.float64) - origin)
+    half_width = cameras.half_width[view]
+    points = vertices[np.concatenate([pair, opposite[:, None]], axis=1)].astype(np.float64)
+    for number in range(cameras.count):  # to camera space, z back; one product a view, not one an edge
+        chosen = np.flatnonzero(view == number)
+        points[chosen] = (points[chosen] - cameras.position[number]) @ cameras.axes[number].T
+    ends, third = points[:, :2], points[:, 2]
     z = -ends[:, :, 2]
     rise = z[:, 1] - z[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):

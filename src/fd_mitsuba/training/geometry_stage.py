@@ -75,6 +75,7 @@ class GeometryStage:
             betas=geometry.betas,
             eps=geometry.eps,
             weight_decay=geometry.weight_decay,
+            fused=True,
         )
         self.focus = _bounding_ball(points[(self.region_sdf > 0).numpy()])
         self.aim = _centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
