@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.errors import RunStopped
+from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -101,3 +101,10 @@ def test_a_field_that_is_not_finite_stops_the_run(stage: Callable[..., GeometryS
         next(broken.field.parameters()).fill_(float("nan"))
     with pytest.raises(RunStopped, match="not finite"):
         broken.check_field(7)
+
+
+def test_normals_in_another_space_than_the_models_are_refused(make_scene: Callable[..., Path]) -> None:
+    guidance = PullMask(+1.0)
+    guidance.normal_space = "world"
+    with pytest.raises(UserError, match="geometry.normal_space=world"):
+        GeometryStage(load_edit_scene(make_scene()), settings(), guidance)

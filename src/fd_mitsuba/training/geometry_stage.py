@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.errors import RunStopped
+from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface, active_vertices
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
@@ -59,6 +59,12 @@ class GeometryStage:
 
     def __init__(self, scene: EditScene, config: RunConfig, guidance: Guidance | None) -> None:
         geometry = config.geometry
+        trained_in = guidance.normal_space if guidance is not None else None
+        if trained_in not in (None, geometry.normal_space):
+            raise UserError(
+                f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.model} was trained with normals "
+                f"in {trained_in} space; set geometry.normal_space={trained_in}"
+            )
         self.scene, self.config, self.guidance = scene, config, guidance
         self.grid = TetGrid(geometry.grid_resolution)
         points = self.grid.vertices.numpy()
