@@ -122,6 +122,9 @@ def start(variant: str = DEFAULT_VARIANT, threads: int = 0) -> ModuleType:
     if version[0] < OLDEST_LLVM:  # Dr.Jit was imported before us and chose for itself
         raise UserError(f"LLVM: Dr.Jit already loaded version {version[0]}; import fd_mitsuba first, or {_REMEDY}")
     mi.set_log_level(mi.LogLevel.Error)  # non-manifold meshes would print themselves whole at every step
+    # With more than one thread Dr.Jit would add into a copy a thread where the target is small, and bake the target's
+    # size into the kernel: a new kernel for every size of mesh.
+    dr.set_expand_threshold(0)
     if threads:
         dr.set_thread_count(threads)
     return mi

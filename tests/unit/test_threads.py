@@ -12,6 +12,7 @@ from fd_mitsuba import threads
 
 def test_the_network_gets_the_cores_and_gives_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
     before = torch.get_num_threads()
+    monkeypatch.setattr(threads, "_network_threads", None)
     with threads.network_threads():
         assert torch.get_num_threads() == before  # nobody shared the cores yet
     monkeypatch.setattr(threads, "_network_threads", before + 1)
