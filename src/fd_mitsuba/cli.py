@@ -99,6 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("-o", "--output", default="work/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, default=4000, help="length of the schedule")
     train.add_argument("--hours", type=float, default=8.0, help="stop after this time at the latest")
+    train.add_argument(
+        "--init", metavar="FOLDER", help="start from a packed prior instead of random weights"
+    )
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("-t", "--threads", type=int, default=0, metavar="N")
     train.set_defaults(call=_prior_train)
@@ -207,8 +210,11 @@ def _prior_train(options: argparse.Namespace) -> int:
     share_cores(options.threads)
     from fd_mitsuba.prior.train import train
 
+    init = Path(options.init) if options.init else None
+    if init is not None and not (init / "model_index.json").is_file():
+        raise UserError(f"{init}: not a packed prior; make one with fd_mitsuba prior pack")
     with network_threads():
-        train(Path(options.output), options.hours * 3600, total_steps=options.steps, seed=options.seed)
+        train(Path(options.output), options.hours * 3600, total_steps=options.steps, seed=options.seed, init=init)
     print(f"{options.output}: checkpoint.pt and log.jsonl")
     return 0
 

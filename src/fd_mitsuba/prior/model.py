@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
+from safetensors.torch import load_file
 from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
 from transformers import CLIPTextConfig, CLIPTextModel, PreTrainedTokenizerFast
 
@@ -58,6 +59,12 @@ def tokenizer_of(folder: Path) -> PreTrainedTokenizerFast:
     if not (path / "tokenizer.json").exists():
         build_tokenizer().save_pretrained(path)
     return PreTrainedTokenizerFast.from_pretrained(str(path), local_files_only=True)
+
+
+def load_packed(packed: Path, modules: torch.nn.ModuleDict) -> None:
+    """Load the weights of a packed pipeline folder into `modules` (`text_encoder`, `unet`)."""
+    modules["text_encoder"].load_state_dict(load_file(packed / "text_encoder" / "model.safetensors"))
+    modules["unet"].load_state_dict(load_file(packed / "unet" / "diffusion_pytorch_model.safetensors"))
 
 
 def build_text_encoder(tokenizer: PreTrainedTokenizerFast) -> CLIPTextModel:

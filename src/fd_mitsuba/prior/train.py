@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 from collections import deque
 from pathlib import Path
@@ -13,7 +14,14 @@ import torch
 
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.corpus import Pair, make_pairs
-from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_unet, encode_text, tokenizer_of
+from fd_mitsuba.prior.model import (
+    build_scheduler,
+    build_text_encoder,
+    build_unet,
+    encode_text,
+    load_packed,
+    tokenizer_of,
+)
 from fd_mitsuba.prior.parts import PARTS
 
 CHANGED_WEIGHT = 4.0
@@ -70,19 +78,21 @@ def train(
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
+    scheduler, checkpoint = build_scheduler(), folder / "checkpoint.pt"
+    fresh = not checkpoint.exists()
+    if init is not None and fresh:
+        shutil.copytree(init / "tokenizer", folder / "tokenizer", dirs_exist_ok=True)
     tokenizer = tokenizer_of(folder)
-    encoder, unet, scheduler = (
-        build_text_encoder(tokenizer),
-        build_unet().to(memory_format=torch.channels_last),
-        build_scheduler(),
-    )
+    encoder, unet = build_text_encoder(tokenizer), build_unet().to(memory_format=torch.channels_last)
     modules = torch.nn.ModuleDict({"text_encoder": encoder, "unet": unet})
+    if init is not None and fresh:
+        load_packed(init, modules)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     optimiser = torch.optim.AdamW(
         modules.parameters(), lr=learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
     )
-    step, checkpoint = 0, folder / "checkpoint.pt"
-    if checkpoint.exists():
+    step = 0
+    if not fresh:
         state = torch.load(checkpoint, weights_only=True)
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
@@ -90,7 +100,7 @@ def train(
     alphas = scheduler.alphas_cumprod
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     pool = Pool(seed * 7919 + step)
-    pool.refresh(3000)
+    pool.refresh(min(3000, total_steps * batch_size))
     started, saved, smooth = time.time(), time.time(), None
 
     def save() -> None:
