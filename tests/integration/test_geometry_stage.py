@@ -108,3 +108,10 @@ def test_normals_in_another_space_than_the_models_are_refused(make_scene: Callab
     guidance.normal_space = "world"
     with pytest.raises(UserError, match="geometry.normal_space=world"):
         GeometryStage(load_edit_scene(make_scene()), settings(), guidance)
+
+
+def test_views_that_fill_no_mosaic_are_refused(make_scene: Callable[..., Path]) -> None:
+    guidance = PullMask(+1.0)
+    guidance.view_grid = 2
+    with pytest.raises(UserError, match="multiple of 4"):
+        GeometryStage(load_edit_scene(make_scene()), settings(views=2), guidance)

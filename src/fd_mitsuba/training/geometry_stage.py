@@ -65,6 +65,12 @@ class GeometryStage:
                 f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.model} was trained with normals "
                 f"in {trained_in} space; set geometry.normal_space={trained_in}"
             )
+        mosaic = guidance.view_grid**2 if guidance is not None else 1
+        if geometry.views % mosaic:
+            raise UserError(
+                f"geometry.views = {geometry.views}: {config.guidance.model} sees {mosaic} views at once; "
+                f"set geometry.views to a multiple of {mosaic}"
+            )
         self.scene, self.config, self.guidance = scene, config, guidance
         self.grid = TetGrid(geometry.grid_resolution)
         points = self.grid.vertices.numpy()
