@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     prior.set_defaults(call=_prior)
     actions = prior.add_subparsers(dest="action", metavar="ACTION")
     train = actions.add_parser("train", help="train on fresh pictures; goes on where the folder's checkpoint ends")
-    train.add_argument("-o", "--output", default="work/prior", metavar="FOLDER", help="checkpoint and log")
+    train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, default=4000, help="length of the schedule")
     train.add_argument("--hours", type=float, default=8.0, help="stop after this time at the latest")
     train.add_argument(
