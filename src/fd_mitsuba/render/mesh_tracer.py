@@ -62,10 +62,12 @@ class MeshTracer:
     def trace(self, ray: mi.Ray3f, coherent: bool, active: mi.Bool | bool = True) -> Hit:
         """The nearest faces along rays, evaluated: later changes of the mesh do not reach the result."""
         with dr.suspend_grad():
-            fixed = self._static.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
             moving = self._moving.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            is_static = fixed.t <= moving.t
-            seen = fixed.is_valid() | moving.is_valid()
+            nearer = mi.Ray3f(ray)
+            nearer.maxt = dr.minimum(ray.maxt, moving.t)  # the second search ends where the first one hit
+            fixed = self._static.scene.ray_intersect_preliminary(nearer, coherent=coherent, active=active)
+            is_static = fixed.is_valid()
+            seen = is_static | moving.is_valid()
             face = dr.select(is_static, fixed.prim_index, moving.prim_index + self._static_faces)
             hit = Hit(
                 seen,

@@ -44,63 +44,69 @@ def clip_outline(
         opposite: (S,) another vertex of a face beside it, which tells on which side of the edge the surface lies.
         vertices: (V, 3) float32.
     """
-    half_width = cameras.half_width[view]
-    points = vertices[np.concatenate([pair, opposite[:, None]], axis=1)].astype(np.float64)
-    for number in range(cameras.count):  # to camera space, z back; one product a view, not one an edge
+    parts = []
+    for number in range(cameras.count):
         chosen = np.flatnonzero(view == number)
-        points[chosen] = (points[chosen] - cameras.position[number]) @ cameras.axes[number].T
-    ends, third = points[:, :2], points[:, 2]
-    z = -ends[:, :, 2]
-    rise = z[:, 1] - z[:, 0]
+        parts.append(_clip_view(number, pair[chosen], opposite[chosen], vertices, cameras))
+    return Outline(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _clip_view(
+    number: int, pair: np.ndarray, opposite: np.ndarray, vertices: np.ndarray, cameras: FilmCameras
+) -> tuple[np.ndarray, ...]:
+    """The fields of `Outline` for one camera. Coordinates are rows here, x, y and z: NumPy is faster that way."""
+
+    def camera_space(index: np.ndarray) -> np.ndarray:
+        return cameras.axes[number] @ (vertices[index] - cameras.position[number]).T
+
+    first, second, third = camera_space(pair[:, 0]), camera_space(pair[:, 1]), camera_space(opposite)
+    first_depth, second_depth = -first[2], -second[2]
+    rise = second_depth - first_depth
     with np.errstate(divide="ignore", invalid="ignore"):
-        cut = np.where(rise != 0, (_NEAREST_DEPTH - z[:, 0]) / rise, 0.0)
-    low = np.where(z[:, 0] < _NEAREST_DEPTH, cut, 0.0)
-    high = np.where(z[:, 1] < _NEAREST_DEPTH, cut, 1.0)
-    alive = z.max(axis=1, initial=0.0) > _NEAREST_DEPTH
-
-    def at(t: np.ndarray) -> np.ndarray:
-        return ends[:, 0] + t[:, None] * (ends[:, 1] - ends[:, 0])
-
-    near, far = at(low), at(high)
-    scale = 0.5 * cameras.size / half_width[:, None]
+        cut = np.where(rise != 0, (_NEAREST_DEPTH - first_depth) / rise, 0.0)
+    low = np.where(first_depth < _NEAREST_DEPTH, cut, 0.0)
+    high = np.where(second_depth < _NEAREST_DEPTH, cut, 1.0)
+    alive = np.maximum(first_depth, second_depth) > _NEAREST_DEPTH
+    edge = second - first
+    near, far = first + low * edge, first + high * edge
+    centre, scale = 0.5 * cameras.size, 0.5 * cameras.size / cameras.half_width[number]
 
     def project(point: np.ndarray) -> np.ndarray:
-        depth = np.maximum(-point[:, 2:], 0.5 * _NEAREST_DEPTH)
-        return 0.5 * cameras.size + point[:, :2] * np.array([1.0, -1.0]) * scale / depth
+        per_depth = scale / np.maximum(-point[2], 0.5 * _NEAREST_DEPTH)
+        return np.stack([centre + point[0] * per_depth, centre - point[1] * per_depth])
 
     start, end = project(near), project(far)
-    enter, leave = np.zeros(len(view)), np.ones(len(view))
-    for axis in range(2):  # the picture's two pairs of borders, each a range of the edge's parameter on the film
-        step = end[:, axis] - start[:, axis]
+    enter, leave = np.zeros(len(pair)), np.ones(len(pair))
+    for begin, step in zip(start, end - start, strict=True):
+        # The picture's two pairs of borders, each a range of the edge's parameter on the film.
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = -start[:, axis] / step, (cameras.size - start[:, axis]) / step
-        inside = (start[:, axis] >= 0) & (start[:, axis] <= cameras.size)
+            one, other = -begin / step, (cameras.size - begin) / step
         level = step == 0
-        enter = np.where(level, enter, np.maximum(enter, np.minimum(first, second)))
-        leave = np.where(level, leave, np.minimum(leave, np.maximum(first, second)))
-        alive &= ~level | inside
+        enter = np.where(level, enter, np.maximum(enter, np.minimum(one, other)))
+        leave = np.where(level, leave, np.minimum(leave, np.maximum(one, other)))
+        alive &= ~level | ((begin >= 0) & (begin <= cameras.size))
     # Across the plane through the camera and the edge; its gradient on the film points to the positive side.
-    plane = np.cross(ends[:, 0], ends[:, 1])
-    side = np.sign(np.einsum("ni,ni->n", plane, third))
-    across = plane[:, :2] * np.array([1.0, -1.0])
-    size = np.linalg.norm(across, axis=1)
+    plane = np.stack([first[k - 2] * second[k - 1] - first[k - 1] * second[k - 2] for k in range(3)])
+    side = np.sign(plane[0] * third[0] + plane[1] * third[1] + plane[2] * third[2])
+    size = np.sqrt(plane[0] ** 2 + plane[1] ** 2)
     keep = np.flatnonzero(alive & (leave > enter) & (size > 0) & (side != 0))
     # Neighbours on the film become neighbours in the list: rays through the same part of the scene are traced together.
-    tile = np.clip(start[keep] / _TILE, -1, cameras.size).astype(np.int64)
-    keep = keep[np.lexsort((tile[:, 0], tile[:, 1], view[keep]))]
-    start, end, enter, leave = start[keep], end[keep], enter[keep, None], leave[keep, None]
-    depth_near, depth_far = -near[keep, 2], -far[keep, 2]
+    tile = np.clip(start[:, keep] / _TILE, -1, cameras.size).astype(np.int64)
+    keep = keep[np.argsort(tile[1] * (cameras.size + 2) + tile[0], kind="stable")]
+    start, step, enter, leave = start[:, keep], (end - start)[:, keep], enter[keep], leave[keep]
+    depth_near, depth_far, low, span = -near[2, keep], -far[2, keep], low[keep], (high - low)[keep]
 
     def along(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        t = s[:, 0] * depth_near / (depth_far * (1 - s[:, 0]) + depth_near * s[:, 0])
-        return low[keep] + t * (high - low)[keep], depth_near + t * (depth_far - depth_near)
+        t = s * depth_near / (depth_far * (1 - s) + depth_near * s)
+        return low + t * span, depth_near + t * (depth_far - depth_near)
 
     (along_0, depth_0), (along_1, depth_1) = along(enter), along(leave)
-    return Outline(
-        view=view[keep],
-        vertices=pair[keep],
-        film=np.stack([start + enter * (end - start), start + leave * (end - start)], axis=1),
-        depth=np.stack([depth_0, depth_1], axis=1),
-        along=np.stack([along_0, along_1], axis=1),
-        outwards=-side[keep, None] * across[keep] / size[keep, None],
+    outwards = np.stack([plane[0, keep], -plane[1, keep]], axis=1) * (-side[keep] / size[keep])[:, None]
+    return (
+        np.full(len(keep), number, dtype=np.int64),
+        pair[keep],
+        np.stack([(start + enter * step).T, (start + leave * step).T], axis=1),
+        np.stack([depth_0, depth_1], axis=1),
+        np.stack([along_0, along_1], axis=1),
+        outwards,
     )

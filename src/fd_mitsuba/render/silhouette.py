@@ -94,7 +94,8 @@ def _convex(
     """View, vertices (S, 2) and the opposite vertex of one face, for edges that do not bend inwards."""
     start, end, opposite = corners(faces, half_a)
     _, _, other = corners(faces, np.maximum(half_b, 0))
-    p, q, a, b = (vertices[index].astype(np.float64) for index in (start, end, opposite, other))
-    bend = np.einsum("ni,ni->n", np.cross(q - p, a - p), b - p)
+    begin = vertices[start].T.astype(np.float64)
+    along, a, b = (vertices[index].T - begin for index in (end, opposite, other))
+    bend = sum((along[k - 2] * a[k - 1] - along[k - 1] * a[k - 2]) * b[k] for k in range(3))
     keep = np.flatnonzero((half_b < 0) | (bend < 0))
     return view[keep], np.stack([start[keep], end[keep]], axis=1), opposite[keep]

@@ -16,7 +16,7 @@ NormalSpace = Literal["camera", "world"]
 
 @dataclass(frozen=True)
 class ShadedMesh:
-    """A mesh in Dr.Jit: positions and part weights may carry gradients, and so do the normals made from them."""
+    """A mesh in Dr.Jit: positions, part weights and normals may carry gradients."""
 
     vertices: mi.Float
     """(3 V) x, y, z of each vertex."""
@@ -24,26 +24,8 @@ class ShadedMesh:
     """(3 F)."""
     part_weight: mi.Float
     """(V) in [0, 1]."""
-    normals: mi.Vector3f
-    """(V) unit length."""
-
-    @classmethod
-    def create(cls, vertices: mi.Float, faces: mi.UInt32, part_weight: mi.Float) -> ShadedMesh:
-        """Adds smooth vertex normals: the sum of the surrounding faces' normals, weighted by area.
-
-        Area, not angle: marching tetrahedra leave slivers, whose angles have derivatives without bound, while the
-        area-weighted sum is a polynomial of the positions.
-        """
-        triangle = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, dr.width(faces) // 3))
-        a, b, c = (dr.gather(mi.Vector3f, vertices, triangle[k]) for k in range(3))
-        normal = dr.cross(b - a, c - a)
-        total = dr.zeros(mi.Vector3f, dr.width(part_weight))
-        for corner in range(3):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, normal, triangle[corner])
-        # A vertex without area has the zero normal, and no gradient.
-        normals = total * dr.rsqrt(dr.maximum(dr.squared_norm(total), 1e-36))
-        dr.eval(normals)
-        return cls(vertices, faces, part_weight, normals)
+    normals: mi.Float
+    """(3 V) x, y, z of each vertex' unit normal."""
 
     def corners(self, face: mi.UInt32, active: mi.Bool) -> mi.Vector3u:
         """Vertex indices of faces."""
