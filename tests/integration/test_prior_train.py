@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
+from fd_mitsuba.prior.kinds import APPEARANCE, KINDS, kind_named
 from fd_mitsuba.prior.pack import pack
 from fd_mitsuba.prior.train import train
 
@@ -26,5 +29,22 @@ def test_training_resumes_and_starts_from_packed_weights(tmp_path: Path) -> None
     for key, value in started["modules"].items():
         if value.is_floating_point():
             assert torch.equal(value, state["average"][key].half().float()), key
-    name = Path("tokenizer") / "tokenizer.json"
-    assert (second / name).read_bytes() == (first / name).read_bytes()
+    assert started["vocabulary"] == state["vocabulary"]
+
+
+def test_the_appearance_prior_trains_with_its_own_pictures(tmp_path: Path) -> None:
+    train(tmp_path / "run", seconds=600, kind=APPEARANCE, batch_size=2, total_steps=1)
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert (state["step"], state["kind"]) == (1, "appearance")
+    pack(tmp_path / "run" / "checkpoint.pt", tmp_path / "packed")
+    text = (builtin_folder(tmp_path / "packed") / "fd_mitsuba.json").read_text()
+    assert '"condition": "clay"' in text and "normal_space" not in text
+    assert sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*")) < 10e6
+    with pytest.raises(UserError, match="--kind appearance"):
+        train(tmp_path / "run", seconds=600, batch_size=2, total_steps=2)
+
+
+def test_kinds_are_named() -> None:
+    assert {kind_named(name).name for name in KINDS} == {"geometry", "appearance"}
+    with pytest.raises(UserError, match="known: geometry, appearance"):
+        kind_named("smell")

@@ -54,7 +54,7 @@ def test_a_pair_differs_only_where_the_part_is() -> None:
     assert np.array_equal(nothing.base, nothing.edited) and nothing.part is None
     random = np.random.default_rng([seed, list(BODIES).index(name)])
     body = BODIES[name](random)
-    camera = corpus._global_camera(random)
+    camera = corpus.global_camera(random)
     assert camera.azimuth_deg == overview.azimuth_deg
     origins, directions, rotations = camera.rays()
     seen = shade(*RayCaster(PARTS[part](body, random)).cast(origins, directions), rotations)[3] > -127

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
@@ -15,7 +19,8 @@ from fd_mitsuba.guidance.interface import GuidanceViews
 from fd_mitsuba.guidance.prompts import unknown_words, view_prompt
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import PART_WORDS, caption, view_words, vocabulary
-from fd_mitsuba.prior.model import TEXT_LENGTH, build_text_encoder, build_tokenizer, build_unet, tokenizer_of
+from fd_mitsuba.prior.evaluate import evaluate
+from fd_mitsuba.prior.model import TEXT_LENGTH, build_text_encoder, build_tokenizer, build_unet
 from fd_mitsuba.prior.pack import pack
 from fd_mitsuba.prior.parts import PARTS
 
@@ -40,9 +45,13 @@ def test_every_word_of_the_vocabulary_is_one_token() -> None:
     assert len(tokenizer.tokenize("jetpack")) > 1
 
 
-def test_a_training_folder_keeps_its_tokenizer(tmp_path: Path) -> None:
-    """Weights fit one numbering only, so training, resume and packing must read the same."""
-    assert len({tuple(sorted(tokenizer_of(tmp_path).get_vocab().items())) for _ in range(3)}) == 1
+def test_tokens_are_numbered_alike_in_every_process() -> None:
+    """Weights fit one numbering only, so training, resume and packing must agree on it."""
+    code = "from fd_mitsuba.prior.model import build_tokenizer as b; import hashlib as h; "
+    code += "print(h.sha256(repr(sorted(b().get_vocab().items())).encode()).hexdigest())"
+    seeds = [{**os.environ, "PYTHONHASHSEED": str(seed)} for seed in (1, 2)]
+    printed = {subprocess.run([sys.executable, "-c", code], env=env, capture_output=True).stdout for env in seeds}
+    assert len(printed) == 1 and len(printed.pop()) == 65
 
 
 def test_captions_stay_within_the_vocabulary_and_the_text_length() -> None:
@@ -109,3 +118,12 @@ def test_a_changed_file_is_noticed(packed: Path) -> None:
             builtin_folder(packed)
     finally:
         path.write_bytes(original)
+
+
+def test_samples_of_a_prior_are_drawn_and_judged(packed: Path, tmp_path: Path) -> None:
+    figures = evaluate(packed, tmp_path / "sheet.png", ["ball"], ["horn"], steps=2)
+    assert {row.part for row in figures} == {None, "horn"} and all(0 <= row.overlap <= 1 for row in figures)
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.size == (3 * 64, 2 * 64)  # no part, the overview and the close-up; truth above, samples below
+    with pytest.raises(UserError, match="'jetpack': no such name"):
+        evaluate(packed, tmp_path / "other.png", ["ball"], ["jetpack"])

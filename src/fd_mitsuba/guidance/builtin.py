@@ -8,11 +8,15 @@ from pathlib import Path
 from fd_mitsuba.errors import UserError
 
 BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "prior" / "weights"
+APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("weights_appearance")
 SUMS_NAME = "SHA256SUMS"
 
 
 def builtin_folder(folder: Path = BUILTIN_FOLDER) -> Path:
-    """The pipeline folder of the built-in prior, after its files were checked against `SHA256SUMS` if that is there.
+    """The pipeline folder of a built-in prior, after its files were checked against `SHA256SUMS` if that is there.
+
+    Args:
+        folder: `BUILTIN_FOLDER` for the geometry stage, `APPEARANCE_FOLDER` for the appearance stage.
 
     Raises:
         UserError: no prior in this installation, a file missing or changed, an unreadable list of hashes.

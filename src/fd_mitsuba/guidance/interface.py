@@ -11,7 +11,8 @@ import torch
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS
 from fd_mitsuba.errors import RunStopped
 
-Phase = Literal["coarse", "refined"]
+Phase = Literal["coarse", "refined", "appearance"]
+"""What the pictures of a step are: normals at the size of the latents, normals at full size, colours."""
 
 
 class NonFiniteGuidance(RunStopped):
@@ -43,6 +44,41 @@ class GuidanceViews:
             raise ValueError(f"pictures must be (B, {len(GEOMETRY_CHANNELS)}, H, H), not {shape}")
         if self.base is not None and tuple(self.base.shape) != shape:
             raise ValueError(f"base pictures {tuple(self.base.shape)} must have the shape of the pictures, {shape}")
+        if not len(self.azimuth_deg) == len(self.elevation_deg) == shape[0]:
+            raise ValueError(f"{shape[0]} pictures need as many azimuths and elevations")
+
+
+@dataclass(frozen=True)
+class AppearanceViews:
+    """Colour pictures of one step; height and width are the same for all, and square.
+
+    Attributes:
+        pictures: (B, 3, H, H) sRGB in [0, 1] of the edited object over the caller's background. Gradients flow to them.
+        condition: the same views with the part in plain grey clay, for a model that sees what it edits, or None.
+        mask: (B, 1, H, H) the object's coverage in [0, 1].
+        part_mask: (B, 1, H, H) the part's coverage in [0, 1].
+        azimuth_deg, elevation_deg, closeup: as in `GuidanceViews`.
+    """
+
+    pictures: torch.Tensor
+    condition: torch.Tensor | None
+    mask: torch.Tensor
+    part_mask: torch.Tensor
+    azimuth_deg: Sequence[float]
+    elevation_deg: Sequence[float]
+    closeup: bool = False
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.pictures.shape)
+        if len(shape) != 4 or shape[1] != 3 or shape[2] != shape[3]:
+            raise ValueError(f"pictures must be (B, 3, H, H), not {shape}")
+        if self.condition is not None and tuple(self.condition.shape) != shape:
+            raise ValueError(
+                f"the condition {tuple(self.condition.shape)} must have the shape of the pictures, {shape}"
+            )
+        for name in ("mask", "part_mask"):
+            if tuple(getattr(self, name).shape) != (shape[0], 1, *shape[2:]):
+                raise ValueError(f"{name} must be {(shape[0], 1, *shape[2:])}, not {tuple(getattr(self, name).shape)}")
         if not len(self.azimuth_deg) == len(self.elevation_deg) == shape[0]:
             raise ValueError(f"{shape[0]} pictures need as many azimuths and elevations")
 
@@ -85,4 +121,26 @@ class Guidance(Protocol):
 
     def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: Phase, seed: int) -> GuidanceResult:
         """The loss of one step; `step` counts from 0 within the phase, `steps_total` is the phase's length."""
+        ...
+
+
+class AppearanceGuidance(Protocol):
+    """A source of guidance for the appearance stage."""
+
+    needs_base: bool
+    """Whether `AppearanceViews.condition` must be given."""
+    view_grid: int
+    """As `Guidance.view_grid`."""
+
+    @property
+    def appearance_size(self) -> int:
+        """Height and width in pixels that suit the model best; other sizes are resized."""
+        ...
+
+    def set_prompt(self, prompt: str, negative_prompt: str = "") -> list[str]:
+        """As `Guidance.set_prompt`."""
+        ...
+
+    def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
+        """The loss of one step; `step` counts from 0 within the stage."""
         ...

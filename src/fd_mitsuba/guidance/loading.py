@@ -14,7 +14,7 @@ import torch
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance.builtin import builtin_folder
+from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
     WEIGHTS,
@@ -47,14 +47,17 @@ class Components:
     folder: Path
 
 
-def load_components(config: GuidanceConfig, device: str = "cpu") -> Components:
+def load_components(config: GuidanceConfig, device: str = "cpu", appearance: bool = False) -> Components:
     """The components of `config.model`, in `config.dtype` (the VAE in float32, since gradients flow through it).
+
+    Args:
+        appearance: `builtin` means the prior of colours, not the one of shapes.
 
     Raises:
         UserError: one line that names the file and what to do, for a folder or hub id that does not exist, a layout
             other than Stable Diffusion's, a missing or damaged file, weights that do not fit the config, no memory.
     """
-    folder = locate(config.model)
+    folder = locate(config.model, appearance)
     index = read_layout(folder)
     configs = {part: read_json(folder / part / "config.json") for part in WEIGHTS}
     conventions = read_model_conventions(folder)
@@ -72,13 +75,13 @@ def load_components(config: GuidanceConfig, device: str = "cpu") -> Components:
     return _load(folder, index, {part: variant for part, (_, variant) in files.items()}, config, conventions, device)
 
 
-def locate(model: str) -> Path:
+def locate(model: str, appearance: bool = False) -> Path:
     """The folder of a model name: `builtin`, an existing folder, or a snapshot of a hub id (fetched, unless offline).
 
     `HF_HUB_OFFLINE=1` keeps to what is in the hub's cache.
     """
     if model == "builtin":
-        return builtin_folder()
+        return builtin_folder(APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER)
     folder = Path(model).expanduser()
     if folder.is_dir():
         return folder

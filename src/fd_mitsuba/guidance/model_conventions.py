@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.vocabulary import Vocabulary
 
 FILE_NAME = "fd_mitsuba.json"
 TEMPLATE_FIELDS = {"prompt", "view", "closeup"}
@@ -25,6 +26,12 @@ class ModelConventions(BaseModel):
     """Frame of the normals in the training pictures; None: the weights do not care."""
     needs_base: bool | None = None
     """If given, must agree with the UNet: 8 input channels take the base's picture as condition, 4 do not."""
+    condition: Literal["base", "clay"] | None = None
+    """What the condition picture shows: the base alone, or the part on it in grey clay. For people, not checked."""
+    latents: Literal["vae", "area_mean"] = "vae"
+    """How colour pictures become latents: by the VAE, or by `colour_latents`, which the VAE then equals."""
+    background: Literal["black", "white"] | None = None
+    """Behind the objects of the training pictures, if always the same. For people, not checked."""
     prompt_template: str = "{prompt}, {closeup}, {view}"
     """Comma-separated items of {prompt}, {view}, {closeup} and fixed words; an item that comes out empty is dropped."""
     view_words: tuple[str, ...] = ()
@@ -35,6 +42,8 @@ class ModelConventions(BaseModel):
     """What {closeup} becomes for views that are centred on the focal regions and close."""
     whole_words: bool = False
     """The tokenizer knows whole words only, so that a word it must split is one the model never saw."""
+    vocabulary: Vocabulary | None = None
+    """The words that the model knows, if they can be listed; a prompt that asks for no known part is refused."""
     about: dict[str, Any] = {}
     """Free remarks (training data, licence); not read."""
 

@@ -135,9 +135,17 @@ def ddim_step(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor, alpha_bar_next:
     return add_noise(clean_estimate(z_t, noise_hat, alpha_bar), noise_hat, alpha_bar_next)
 
 
-def normalising_scale(gradient: Tensor) -> float:
-    """1 / mean |g|: a gradient times this has mean size 1, so that step sizes do not depend on t."""
-    return 1 / max(float(gradient.abs().mean()), torch.finfo(gradient.dtype).tiny)
+def normalising_scale(gradient: Tensor, mask: Tensor | None = None) -> float:
+    """1 / mean |g|: a gradient times this has mean size 1, so that step sizes do not depend on t.
+
+    With a mask (N, 1, L, L) of zeros and ones the mean is over its ones; a mask without any gives 1.
+    """
+    size = gradient.abs()
+    if mask is not None:
+        size = size[mask.expand_as(size) > 0]
+        if not size.numel():
+            return 1.0
+    return 1 / max(float(size.mean()), torch.finfo(gradient.dtype).tiny)
 
 
 def carry_gradient(inputs: Tensor, gradient: Tensor, value: float) -> Tensor:

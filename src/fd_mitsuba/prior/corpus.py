@@ -13,13 +13,15 @@ import numpy as np
 
 from fd_mitsuba.mitsuba_api import start
 from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.captions import caption, view_words
+from fd_mitsuba.prior.captions import caption, random_style, view_words
 from fd_mitsuba.prior.parts import PARTS
 from fd_mitsuba.prior.primitives import Solid
 
 VIEW_SIZE = 32
 SUPERSAMPLING = 2
 CAMERA_RADIUS = 3.0
+STYLED_SHARE = 0.3
+"""Captions that also name a colour or material, which normals do not show: the words must not disturb the shape."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,10 @@ class Pair:
     part: str | None
     azimuth_deg: float
     closeup: bool
+
+    def changed(self) -> np.ndarray:
+        """Where the part is (64, 64) bool: the pixels that count most in training."""
+        return np.abs(self.edited.astype(np.int16) - self.base).max(0) > 12
 
 
 class RayCaster:
@@ -52,13 +58,18 @@ class RayCaster:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,), inf where nothing is hit, and world normal (N, 3) for rays (N, 3), (N, 3)."""
+        distance, normal, _ = self.trace(origins, directions)
+        return distance, normal
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `cast`, and the face (N,) that each ray hits; faces of rays that hit nothing mean nothing."""
         mi = self._mi
         ray = mi.Ray3f(
             mi.Point3f(np.ascontiguousarray(origins.T, np.float32)),
             mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)),
         )
         hit = self._scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
-        return np.array(hit.t), np.array(hit.sh_frame.n).T
+        return np.array(hit.t), np.array(hit.sh_frame.n).T, np.array(hit.prim_index)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -114,13 +125,15 @@ def shade(distance: np.ndarray, normal: np.ndarray, rotations: np.ndarray) -> np
     return np.clip(np.rint(mosaic * 127), -127, 127).astype(np.int8)
 
 
-def _global_camera(rng: np.random.Generator) -> MosaicCamera:
+def global_camera(rng: np.random.Generator) -> MosaicCamera:
+    """Cameras that see the whole object."""
     fov = 2 * np.rad2deg(np.arctan(rng.uniform(1.05, 1.45) / CAMERA_RADIUS))
     target = np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.2, 0.35), rng.uniform(-0.06, 0.06)])
     return MosaicCamera(rng.uniform(0, 90), rng.uniform(-10, 45), fov, target)
 
 
-def _closeup_camera(part: Solid, rng: np.random.Generator) -> MosaicCamera:
+def closeup_camera(part: Solid, rng: np.random.Generator) -> MosaicCamera:
+    """Cameras centred on a part, so near that it fills much of the view."""
     low, high = part.vertices.min(0), part.vertices.max(0)
     radius = np.linalg.norm(high - low) / 2
     half = np.clip(radius * rng.uniform(1.1, 1.9), 0.3, 1.25)
@@ -134,12 +147,12 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
     """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
     made = BODIES[body](rng)
-    base_caster, overview, pairs = RayCaster(made.solid), _global_camera(rng), []
+    base_caster, overview, pairs = RayCaster(made.solid), global_camera(rng), []
     overview_hits = None
     for part in parts:
         solid = None if part is None else PARTS[part](made, rng)
         caster = None if solid is None else RayCaster(solid)
-        cameras = [(overview, False)] if solid is None else [(overview, False), (_closeup_camera(solid, rng), True)]
+        cameras = [(overview, False)] if solid is None else [(overview, False), (closeup_camera(solid, rng), True)]
         for camera, closeup in cameras:
             origins, directions, rotations = camera.rays()
             if closeup or overview_hits is None:
@@ -155,7 +168,8 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
                     np.where(nearer, part_distance, distance),
                     np.where(nearer[:, None], part_normal, normal),
                 )
-            words = f"{caption(body, part, rng)}, {view_words(camera.azimuth_deg, closeup)}"
+            style = random_style(rng) if rng.random() < STYLED_SHARE else ""
+            words = f"{caption(body, part, rng, style)}, {view_words(camera.azimuth_deg, closeup)}"
             pairs.append(
                 Pair(
                     shade(*base_hits, rotations),

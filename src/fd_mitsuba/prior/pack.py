@@ -10,29 +10,29 @@ import diffusers
 import torch
 
 from fd_mitsuba.guidance.builtin import SUMS_NAME
-from fd_mitsuba.prior.model import build_scheduler, build_text_encoder, build_unet, save_conventions, tokenizer_of
-from fd_mitsuba.prior.vae import build_vae
+from fd_mitsuba.prior.kinds import GEOMETRY, kind_named
+from fd_mitsuba.prior.model import build_scheduler, build_tokenizer
 
 
 def pack(checkpoint: Path, folder: Path) -> None:
     """Write the averaged weights of a checkpoint as an InstructPix2Pix-layout pipeline folder.
 
     Args:
-        checkpoint: `checkpoint.pt` of `prior.train.train`, in its training folder.
+        checkpoint: `checkpoint.pt` of `prior.train.train`; it says which kind of prior it is.
         folder: created; existing files are replaced.
     """
-    average = torch.load(checkpoint, weights_only=True)["average"]
-    tokenizer = tokenizer_of(checkpoint.parent)
-    modules = torch.nn.ModuleDict({"text_encoder": build_text_encoder(tokenizer), "unet": build_unet()})
-    missing = modules.load_state_dict(average, strict=False).missing_keys
+    state = torch.load(checkpoint, weights_only=True)
+    kind, tokenizer = kind_named(state.get("kind", GEOMETRY.name)), build_tokenizer()
+    modules = kind.build_modules(tokenizer)
+    missing = modules.load_state_dict(state["average"], strict=False).missing_keys
     if any("position_ids" not in key for key in missing):
         raise ValueError(f"{checkpoint}: lacks {missing}")
     folder.mkdir(parents=True, exist_ok=True)
     modules["unet"].half().save_pretrained(folder / "unet")
     modules["text_encoder"].half().save_pretrained(folder / "text_encoder")
-    build_vae().half().save_pretrained(folder / "vae")
+    kind.build_vae().half().save_pretrained(folder / "vae")
     tokenizer.save_pretrained(folder / "tokenizer")
-    build_scheduler().save_pretrained(folder / "scheduler")
+    build_scheduler(kind.prediction).save_pretrained(folder / "scheduler")
     index = {
         "_class_name": "StableDiffusionInstructPix2PixPipeline",
         "_diffusers_version": diffusers.__version__,
@@ -47,7 +47,7 @@ def pack(checkpoint: Path, folder: Path) -> None:
         "vae": ["diffusers", "AutoencoderTiny"],
     }
     (folder / "model_index.json").write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
-    save_conventions(folder)
+    kind.save_conventions(folder)
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != SUMS_NAME)
     lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}\n" for p in files]
     (folder / SUMS_NAME).write_text("".join(lines), encoding="utf-8")

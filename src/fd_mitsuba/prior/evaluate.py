@@ -1,0 +1,115 @@
+"""What the geometry prior draws when it is asked directly: DDIM samples of parts on bodies, beside the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.prior.bodies import BODIES
+from fd_mitsuba.prior.captions import HELD_OUT
+from fd_mitsuba.prior.corpus import Pair, make_pairs
+from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.threads import network_threads
+
+UNSEEN_SEED = 1_000_000_000
+"""Bodies and parts of the evaluation come from seeds beyond this; training draws below 2^31 at random, so a clash of
+one seed in two thousand million is as good as none."""
+_KEPT_WITHIN = 0.15
+_KEPT_SHARE = 0.95
+
+
+@dataclass(frozen=True)
+class SampleFigures:
+    """Shares in [0, 1] over the samples of one part; None stands for prompts without a part.
+
+    Attributes:
+        body_kept: samples that leave at least 95 % of the body's pixels outside the true part as they are.
+        overlap: mean intersection over union of what changed, in the sample and in truth. The truth is one of many
+            right answers, so this is a comparison between trainings, not a score.
+        held_out: whether combinations that training never showed are counted alone.
+    """
+
+    part: str | None
+    held_out: bool
+    count: int
+    body_kept: float
+    overlap: float
+
+
+@network_threads()
+@torch.no_grad()
+def draw_samples(
+    guidance: DiffusionGuidance, base: torch.Tensor, captions: list[str], seed: int, steps: int = 16, scale: float = 3.0
+) -> torch.Tensor:
+    """Clean latents (N, 4, 64, 64) after `steps` DDIM steps from noise, given the base's latents and full captions."""
+    generator = torch.Generator().manual_seed(seed)
+    z = torch.randn(base.shape, generator=generator)
+    passes = sds.cfg_coefficients_with_image(scale, 1.0)
+    texts = guidance.embeddings(captions, passes)
+    times = torch.linspace(len(guidance.alpha_bars) - 1, 0, steps + 1).round().long()
+    for now, following in zip(times[:-1], times[1:], strict=True):
+        repeated = now.repeat(len(base))
+        noise = sds.combine(guidance.predict_noise(z, repeated, texts, base), passes)
+        z = sds.ddim_step(z, noise, guidance.alpha_bars[repeated], guidance.alpha_bars[following.repeat(len(base))])
+    return z
+
+
+def evaluate(
+    folder: Path, output: Path, bodies: list[str], parts: list[str], seed: int = 0, steps: int = 16
+) -> list[SampleFigures]:
+    """Write `output` (one row of truth and one of samples a body; overviews left, close-ups right) and measure.
+
+    Args:
+        folder: a packed pipeline folder.
+        bodies, parts: names of the vocabulary.
+        steps: of DDIM.
+
+    Raises:
+        UserError: a name outside the vocabulary.
+    """
+    for name, known in [*((body, BODIES) for body in bodies), *((part, PARTS) for part in parts)]:
+        if name not in known:
+            raise UserError(f"{name!r}: no such name; known: {', '.join(known)}")
+    guidance = DiffusionGuidance.load(GuidanceConfig(model=str(folder), views_per_call=16))
+    rows, judged = [], []
+    for number, body in enumerate(bodies):
+        pairs = make_pairs(body, [*parts, None], UNSEEN_SEED + 1000 * seed + list(BODIES).index(body))
+        base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
+        sampled = draw_samples(guidance, base, [pair.caption for pair in pairs], seed * 100 + number, steps)
+        judged += [_judge(pair, latent.numpy()) for pair, latent in zip(pairs, sampled, strict=True)]
+        order = sorted(range(len(pairs)), key=lambda i: pairs[i].closeup)
+        truth = np.concatenate([_colours(pairs[i].edited / 127.0) for i in order], axis=1)
+        drawn = np.concatenate([_colours(sampled[i].numpy()) for i in order], axis=1)
+        rows += [truth, drawn]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(rows)).save(output)
+    figures = []
+    for part in (None, *parts):
+        for held_out in (False, True):
+            of_part = [j for p, b, j in judged if p == part and ((b, p) in HELD_OUT) == held_out]
+            if of_part:
+                kept, overlap = np.mean(of_part, axis=0)
+                figures.append(SampleFigures(part, held_out, len(of_part), float(kept), float(overlap)))
+    return figures
+
+
+def _judge(pair: Pair, sample: np.ndarray) -> tuple[str | None, str, tuple[float, float]]:
+    base, truth = pair.base / 127.0, pair.edited / 127.0
+    changed, wanted = (np.abs(picture - base).max(0) > 2 * _KEPT_WITHIN for picture in (sample, truth))
+    body = (base[3] > -0.5) & ~wanted
+    kept = (np.abs(sample - base).max(0) < _KEPT_WITHIN)[body].mean() > _KEPT_SHARE if body.any() else True
+    union = (changed | wanted).sum()
+    return pair.part, pair.body, (float(kept), float((changed & wanted).sum() / union) if union else 1.0)
+
+
+def _colours(latent: np.ndarray) -> np.ndarray:
+    mask = (latent[3:] + 1) / 2
+    return (np.clip((latent[:3] + mask) / 2, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
