@@ -1,6 +1,7 @@
 # Everything runs in .venv, which the first target that needs it creates.
 #   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
-#   make test | bench | lint | clean
+#   make test                              all fast tests (minutes); PYTEST_ARGS="-k union -x" narrows them down
+#   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
 SCENE ?= scenes/pegasus/scene.xml
@@ -28,7 +29,7 @@ llvm:
 demo: $(STAMP) llvm
 	@if [ -e "$(OUT)" ]; then mv "$(OUT)" "$(OUT).until-$$(date +%Y%m%d-%H%M%S)"; fi
 	$(PY) -m fd_mitsuba run $(SCENE) -c $(CONFIG) -o $(OUT)
-	@echo "pictures: $(OUT)/images and $(OUT)/videos    meshes: $(OUT)/export"
+	@echo "look at $(OUT)/images/turntable.png (shape) and images/appearance.png (material); $(OUT)/export/asset.glb opens in Blender"
 
 test: $(STAMP) llvm
 	$(PY) -m pytest $(PYTEST_ARGS)

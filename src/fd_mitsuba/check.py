@@ -19,6 +19,12 @@ from fd_mitsuba.scene.triangle_mesh import Topology, topology
 THINNEST_IN_CELLS = 3.0
 """A region thinner than this many cells of the grid loses its shape in the marching tetrahedra."""
 
+START_AND_EXPORT_SECONDS = 15.0
+"""What every run takes besides its steps: imports, kernels, meshes, turntable."""
+
+_OPERATIONS = 6e10
+"""Floating-point operations a second of two cores on the networks of Stable Diffusion."""
+
 _REACH = 0.15
 """How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
 
@@ -73,6 +79,9 @@ class CheckReport:
     """Longest side of the base's bounding box in the user's units."""
     grid_cell: float
     """Side of a grid cell in the user's units."""
+    grid_low: tuple[float, ...]
+    grid_high: tuple[float, ...]
+    """Corners of the cube in the user's units within which a part can grow."""
     regions: tuple[RegionCheck, ...]
     cost: CostEstimate
     warnings: tuple[str, ...]
@@ -90,6 +99,8 @@ class CheckReport:
             pieces = f"{found.components} component{'s' if found.components != 1 else ''}"
             lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
         lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
+        spans = zip("xyz", self.grid_low, self.grid_high, strict=True)
+        lines.append(f"grid     {', '.join(f'{axis} {low:.4g} to {high:.4g}' for axis, low, high in spans)}")
         for region in self.regions:
             touch = "touches the base" if region.gap_to_base == 0 else f"{region.gap_to_base:.3g} from the base"
             lines.append(
@@ -98,7 +109,7 @@ class CheckReport:
             )
         cost = self.cost
         lines.append(
-            f"cost     about {cost.seconds_per_step:.2g} s a step, {_duration(cost.seconds_total)} in all, "
+            f"cost     about {_number(cost.seconds_per_step)} s a step, {_duration(cost.seconds_total)} in all, "
             f"{cost.memory_mb / 1000:.1f} GB of memory; {cost.active_share:.1%} of the grid active"
         )
         lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
@@ -125,10 +136,16 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         base_closed=all(mesh.topology.closed for mesh in base),
         longest_side=float(np.ptp(used, axis=0).max()),
         grid_cell=cell / scene.frame.scale,
+        grid_low=_user_corner(scene, -GRID_HALF_EXTENT),
+        grid_high=_user_corner(scene, GRID_HALF_EXTENT),
         regions=regions,
         cost=cost,
         warnings=tuple(_base_warnings(base) + _region_warnings(regions, config) + _scene_warnings(scene, config)),
     )
+
+
+def _user_corner(scene: EditScene, value: float) -> tuple[float, ...]:
+    return tuple(float(x) for x in scene.frame.to_user(np.full(3, value)))
 
 
 def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell: float) -> RegionCheck:
@@ -149,12 +166,12 @@ def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell:
 def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     """A rough forecast of a geometry run's time and memory, by counting what a step touches.
 
-        step = fixed + field (active vertices) + surface (faces) + rays + guidance (forward passes of the network)
+        step = fixed + field (active vertices) + surface (faces) + rays + guidance (passes of the networks)
 
-    The constants are fitted to `benchmarks/geometry_step.py` with 2 cores, no GPU: 0.115 s a step on the pegasus
-    scene's default grid (15k active vertices, 36k faces, 82k rays) and 0.24 s on the grid of 128 cells a side (123k
-    active vertices, 145k faces). The built-in prior takes 0.06 s for each pass over four views, so that a step of
-    `configs/quick.toml` comes to 0.2 s; it was measured at 0.20 to 0.26 s, and at 0.36 s beside another busy process.
+    averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
+    them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores, no GPU:
+    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase, peaks of
+    1.1, 1.2 and 1.2 GB; importing, compiling and exporting took 15 s.
     """
     geometry, guidance = config.geometry, config.guidance
     axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
@@ -166,22 +183,32 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     queries = active + geometry.focal_samples
     field = 3.5e-8 * config.field.levels * queries
     surface = 8e-7 * 8.6 * vertices ** (2 / 3)
-    side = 32 if guidance.model == "builtin" else 64
-    rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
+    builtin = guidance.model == "builtin"
+    side = 32 if builtin else 64
+    refined = 1 - geometry.coarse_fraction
+    coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
+    refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
     weights, source = _unet_weights(guidance.model)
     passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
-    if guidance.model == "builtin":
-        forward = 0.06 / 4  # four views are one picture to it
+    if builtin:
+        forward, encoder = 0.1 / 4, 0.1 / 4  # four views are one picture to it
     else:
-        forward = 800.0 * weights / 6e10  # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent
-    step = 0.03 + field + surface + rays + passes * forward
+        # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
+        forward, encoder = 800.0 * weights / _OPERATIONS, 2.2e12 / _OPERATIONS
+    image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
+    step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
     assumptions = (
         "2 cores of about 60 GFLOP/s together, otherwise idle, and views at the size of the latent",
         f"a UNet of {weights / 1e6:.3g} million weights ({source})",
         f"{queries} queries of the part's field a step",
     )
-    memory = 900 + 4e-6 * weights * 1.4 + 6e-4 * vertices + 0.012 * queries * config.field.levels / 10
-    return CostEstimate(active, share, step, step * geometry.steps, memory, assumptions)
+    memory = 850 + 5e-5 * vertices + 7e-5 * queries * config.field.levels
+    if geometry.lambda_sds > 0:
+        size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
+        memory += 100 + 1.2e-6 * weights * size
+        if not builtin:  # as `guidance.memory` will demand: one call of the UNet, and the encoder's maps for half of it
+            memory += 65 * size * guidance.views_per_call + 3300 * max(1, guidance.views_per_call // 2)
+    return CostEstimate(active, share, step, step * geometry.steps + START_AND_EXPORT_SECONDS, memory, assumptions)
 
 
 def _unet_weights(model: str) -> tuple[float, str]:
@@ -229,7 +256,7 @@ def _region_warnings(regions: tuple[RegionCheck, ...], config: RunConfig) -> lis
         if region.share_in_grid < 0.995:
             warnings.append(
                 f"{name}: {1 - region.share_in_grid:.0%} of it lies outside the grid and cannot be edited; "
-                "move or shrink it"
+                "move or shrink it until it fits the grid's extent above"
             )
         if region.gap_to_base > 0:
             warnings.append(
@@ -260,6 +287,10 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
     if config.geometry.lambda_focal == 0:
         warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")
     return warnings
+
+
+def _number(value: float) -> str:
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
 def _duration(seconds: float) -> str:

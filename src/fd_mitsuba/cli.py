@@ -1,6 +1,7 @@
 """The command line: parse, call, print.
 
-Exit codes: 0 done, 1 bad input, 2 usage, 130 interrupted (a run within its steps writes a checkpoint first).
+Exit codes: 0 done, 1 bad input, 2 usage, 130 interrupted by SIGINT or SIGTERM (a run within its steps writes a
+checkpoint first).
 """
 
 from __future__ import annotations
@@ -9,22 +10,26 @@ import argparse
 import json
 import os
 import shlex
+import signal
 import sys
-import warnings
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 from fd_mitsuba import __version__
-from fd_mitsuba.config import load_config
+from fd_mitsuba.cli_export import add_export_commands
+from fd_mitsuba.cli_options import definitions, machine_options, remark, start
+from fd_mitsuba.cli_prior import add_prior_commands
 from fd_mitsuba.errors import Interrupted, UserError
-
-DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code; user errors become one line on stderr."""
+    own_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
+    if own_process:
+        _exit_on_signals(options)
     options.command_line = shlex.join(["fd_mitsuba", *arguments])
     verbose = getattr(options, "verbose", False)
     try:
@@ -38,8 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"fd_mitsuba: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        remedy = "; continue with --resume" if options.call is _run else ""
-        print(f"fd_mitsuba: interrupted{remedy}", file=sys.stderr)
+        print(_interrupted(options), file=sys.stderr)
         return 130
     except OSError as error:
         if verbose:
@@ -49,6 +53,25 @@ def main(arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _exit_on_signals(options: argparse.Namespace) -> None:
+    """From here on SIGINT and SIGTERM end the process in one line; within a run's steps the loop has its own way.
+
+    The process ends in the handler: an exception raised from there while a library is being imported, or in a callback
+    of native code, ends in a traceback or an abort instead. Files are written so that this does no harm.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, f"{_interrupted(options)}\n".encode())
+        os._exit(130)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+
+
+def _interrupted(options: argparse.Namespace) -> str:
+    return "fd_mitsuba: interrupted" + ("; continue with --resume" if options.call is _run else "")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -70,7 +93,12 @@ def _parser() -> argparse.ArgumentParser:
         "--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting"
     )
     run.add_argument("-o", "--output", metavar="FOLDER", help="run folder; default: runs/<scene>")
-    run.add_argument("--prompt", help="instead of the scene's prompt")
+    run.add_argument(
+        "--stage", choices=("all", "geometry", "appearance"), default="all", help="default: all, one after the other"
+    )
+    run.add_argument(
+        "--from", dest="geometry_from", metavar="RUN", help="take the finished geometry of another run of this scene"
+    )
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run in the output folder")
     run.add_argument("-q", "--quiet", action="store_true", help="no progress display")
     run.set_defaults(call=_run)
@@ -87,28 +115,13 @@ def _parser() -> argparse.ArgumentParser:
     preview.add_argument("-o", "--output", metavar="FOLDER", help="default: runs/<scene>_preview")
     preview.set_defaults(call=_preview)
 
+    add_export_commands(commands)
+
     doctor = commands.add_parser("doctor", help="what this machine offers: LLVM, Mitsuba, torch, the built-in prior")
     doctor.add_argument("--json", action="store_true")
     doctor.set_defaults(call=_doctor)
 
-    prior = commands.add_parser("prior", help="the words that the built-in prior knows; train and pack a new one")
-    prior.add_argument("--json", action="store_true")
-    prior.set_defaults(call=_prior)
-    actions = prior.add_subparsers(dest="action", metavar="ACTION")
-    train = actions.add_parser("train", help="train on fresh pictures; goes on where the folder's checkpoint ends")
-    train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
-    train.add_argument("--steps", type=int, default=4000, help="length of the schedule")
-    train.add_argument("--hours", type=float, default=8.0, help="stop after this time at the latest")
-    train.add_argument(
-        "--init", metavar="FOLDER", help="start from a packed prior instead of random weights"
-    )
-    train.add_argument("--seed", type=int, default=0)
-    train.add_argument("-t", "--threads", type=int, default=0, metavar="N")
-    train.set_defaults(call=_prior_train)
-    pack = actions.add_parser("pack", help="write a checkpoint as a pipeline folder")
-    pack.add_argument("checkpoint", help="checkpoint.pt of a training")
-    pack.add_argument("-o", "--output", required=True, metavar="FOLDER")
-    pack.set_defaults(call=_prior_pack)
+    add_prior_commands(commands)
     return parser
 
 
@@ -117,28 +130,34 @@ def _scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
     )
-    parser.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant")
+    parser.add_argument("--prompt", help="instead of the scene's prompt")
     parser.add_argument(
-        "-t", "--threads", type=int, default=0, metavar="N", help="threads; 0: all cores, 1: bit-reproducible"
+        "--regions", metavar="FILE", help="an XML file with focal regions, such as for a scene that was exported"
     )
-    parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and library warnings")
+    machine_options(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
-    from dataclasses import replace
+    from fd_mitsuba.config import load_config
 
     config = load_config(options.config, options.overrides)
-    prompt = None if options.prompt is None else " ".join(options.prompt.split())
-    if prompt == "":
-        raise UserError("--prompt: is blank; say what the edited object shall look like")
     scene = _load(options)
-    if prompt is not None:
-        scene = replace(scene, prompt=prompt)
-    from fd_mitsuba.pipeline import run
+    from fd_mitsuba.pipeline import STAGES, run
 
     folder = Path(options.output) if options.output else Path("runs") / Path(options.scene).resolve().parent.name
-    metrics = run(scene, config, folder, options.resume, options.command_line, options.quiet, _remark)
-    print(f"{folder}: part in export/, pictures in images/turntable.png and videos/turntable.mp4")
+    metrics = run(
+        scene,
+        config,
+        folder,
+        resume=options.resume,
+        command=options.command_line,
+        quiet=options.quiet,
+        say=remark,
+        stages=STAGES if options.stage == "all" else (options.stage,),
+        geometry_from=Path(options.geometry_from) if options.geometry_from else None,
+    )
+    lit = "appearance" in metrics
+    print(f"{folder}: part in export/, pictures in images/{'appearance' if lit else 'turntable'}.png and videos/")
     print(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
         f"base identical: {metrics['base_identical']}, {metrics['seconds']:.0f} s"
@@ -147,6 +166,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    from fd_mitsuba.config import load_config
+
     config = load_config(options.config, options.overrides)
     scene = _load(options)
     from fd_mitsuba.check import check_scene
@@ -179,73 +200,13 @@ def _doctor(options: argparse.Namespace) -> int:
     return 0 if all(finding.ok for finding in findings) else 1
 
 
-def _prior(options: argparse.Namespace) -> int:
-    from fd_mitsuba.prior.captions import ADJECTIVES, BODY_WORDS, PART_WORDS
-
-    words = {
-        "bodies": {name: list(synonyms) for name, synonyms in BODY_WORDS.items()},
-        "parts": {name: list(synonyms) for name, synonyms in PART_WORDS.items()},
-        "adjectives": sorted(set(ADJECTIVES) - {""}),
-    }
-    if options.json:
-        print(json.dumps(words, indent=2))
-        return 0
-    for group in ("bodies", "parts"):
-        print(f"{group}:")
-        for synonyms in words[group].values():
-            print(f"  {', '.join(synonyms)}")
-    print(f"adjectives: {', '.join(words['adjectives'])}")
-    print('a prompt is a sentence such as "a horse with two wings"; for anything else set guidance.model to the')
-    print("folder or hub id of a Stable Diffusion model")
-    return 0
-
-
-def _remark(line: str) -> None:
-    print(f"fd_mitsuba: {line}", file=sys.stderr)
-
-
-def _prior_train(options: argparse.Namespace) -> int:
-    from fd_mitsuba.threads import network_threads, share_cores
-
-    share_cores(options.threads)
-    from fd_mitsuba.prior.train import train
-
-    init = Path(options.init) if options.init else None
-    if init is not None and not (init / "model_index.json").is_file():
-        raise UserError(f"{init}: not a packed prior; make one with fd_mitsuba prior pack")
-    with network_threads():
-        train(Path(options.output), options.hours * 3600, total_steps=options.steps, seed=options.seed, init=init)
-    print(f"{options.output}: checkpoint.pt and log.jsonl")
-    return 0
-
-
-def _prior_pack(options: argparse.Namespace) -> int:
-    from fd_mitsuba.prior.pack import pack
-
-    if not Path(options.checkpoint).is_file():
-        raise UserError(f"{options.checkpoint}: no such checkpoint; make one with fd_mitsuba prior train")
-    pack(Path(options.checkpoint), Path(options.output))
-    print(options.output)
-    return 0
-
-
 def _load(options: argparse.Namespace):
     """The scene, with Mitsuba started as the options say."""
-    parameters = {}
-    for item in options.definitions:
-        name, separator, value = item.partition("=")
-        if not separator or not name:
-            raise UserError(f"-D {item}: write -D name=value")
-        parameters[name] = value
-    if options.threads < 0:
-        raise UserError(f"-t {options.threads}: give 0 (all cores) or a positive number")
-    if not options.verbose:
-        warnings.filterwarnings("ignore")
-        os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
-        os.environ.setdefault("DIFFUSERS_VERBOSITY", "error")
-    from fd_mitsuba.threads import share_cores
-
-    share_cores(options.threads, options.variant)
+    parameters = definitions(options)
+    prompt = None if options.prompt is None else " ".join(options.prompt.split())
+    if prompt == "":
+        raise UserError("--prompt: is blank; say what the edited object shall look like")
+    start(options)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-    return load_edit_scene(options.scene, parameters)
+    return load_edit_scene(options.scene, parameters, options.regions, prompt)

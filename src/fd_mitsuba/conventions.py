@@ -18,6 +18,8 @@ Colour
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 BASE_LONGEST_SIDE = 1.8
 """Longest side of the base's bounding box in the canonical frame (paper's data; the grid leaves room around it)."""
 
@@ -26,6 +28,10 @@ GRID_HALF_EXTENT = 1.05
 
 GEOMETRY_CHANNELS = ("normal_x", "normal_y", "normal_z", "mask", "part_mask")
 """Channels of a geometry picture: normal times coverage in [-1, 1], then two coverages in [0, 1]."""
+
+TextureChannel = Literal["base_color", "roughness", "metallic", "normal"]
+TEXTURE_CHANNELS: tuple[TextureChannel, ...] = get_args(TextureChannel)
+"""What a texture field says at a point: kd, the two of krm, kn."""
 
 BASE_NAME = "base"
 DEFAULT_PART_NAME = "part"

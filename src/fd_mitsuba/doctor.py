@@ -10,6 +10,7 @@ from importlib import metadata
 from typing import NamedTuple
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.threads import available_cores
 
 
 class Finding(NamedTuple):
@@ -28,7 +29,7 @@ def examine() -> list[Finding]:
             sys.version_info >= (3, 11),
             f"{platform.python_version()} ({platform.machine()}); 3.11 or newer is needed",
         ),
-        Finding("cores", True, str(os.cpu_count())),
+        Finding("cores", True, f"{available_cores()} of {os.cpu_count()} may be used"),
         _attempt("llvm", _llvm),
         _attempt("mitsuba", _mitsuba),
         _attempt("torch", _torch),
@@ -62,13 +63,13 @@ def _mitsuba() -> str:
     total = dr.sum(dr.arange(mi.Float, 4))[0]
     if total != 6:
         raise UserError(f"a test kernel returned {total} instead of 6; reinstall mitsuba")
-    return f"{mi.__version__}, variant {mi.variant()}, {dr.thread_count()} threads, a test kernel ran"
+    return f"{mi.__version__}, variant {mi.variant()}, a test kernel ran"
 
 
 def _torch() -> str:
     import torch
 
-    return f"{torch.__version__}, {torch.get_num_threads()} threads"
+    return str(torch.__version__)
 
 
 def _prior() -> str:

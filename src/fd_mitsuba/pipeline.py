@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from fd_mitsuba import __version__
+from fd_mitsuba.appearance import finished_appearance, prepare_appearance, run_appearance
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.locality import measure_locality
 from fd_mitsuba.evaluation.turntable import render_ring, write_sheet, write_video
+from fd_mitsuba.export.assets import PartAsset, export_assets
+from fd_mitsuba.export.cut_shapes import CutBase, cut_base
 from fd_mitsuba.export.meshes import copy_base, write_mesh
+from fd_mitsuba.export.part_record import part_file, part_record
+from fd_mitsuba.export.part_solid import part_solid
+from fd_mitsuba.export.solid import LEAST_FACES, Solid
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.vocabulary import read_prompt
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.training.checkpoint import list_checkpoints, load_newest
+from fd_mitsuba.scene.scene_file import SceneFile
+from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_newest, write_atomically
 from fd_mitsuba.training.geometry_stage import GeometryStage
-from fd_mitsuba.training.loop import STAGE, run_geometry
-from fd_mitsuba.training.run_folder import check_folder, describe_run, write_json
+from fd_mitsuba.training.loop import run_stage
+from fd_mitsuba.training.run_folder import check_folder, describe_run, discarded_without_checkpoint, write_json
+from fd_mitsuba.training.saved_run import saved_run
 
+STAGES = ("geometry", "appearance")
 _SHEET_VIEWS = 8
 
 
@@ -33,39 +44,75 @@ def run(
     command: str = "",
     quiet: bool = False,
     say: Callable[[str], None] = print,
+    stages: Collection[str] = STAGES,
+    geometry_from: Path | None = None,
 ) -> dict:
-    """Grow the part and write the run folder; returns what `metrics.json` holds.
+    """Grow the part, give it its material, and write the run folder; returns what `metrics.json` holds.
 
     Args:
         folder: made if it is missing; must be empty, or hold a run of the same scene and settings to go on with.
         resume: go on with the run in `folder`.
         command: the command line, for the record.
         say: takes remarks for the user, a line each.
+        stages: which of `STAGES` to run. The appearance stage alone needs a folder whose geometry stage is finished.
+        geometry_from: another run folder, whose finished geometry is taken over instead of running that stage.
 
     Raises:
-        UserError, RunStopped, Interrupted: see `training.loop.run_geometry`.
+        UserError, RunStopped, Interrupted: see `training.loop.run_stage`. A run that ends with an error before its
+            first checkpoint leaves no folder behind.
     """
     started = time.monotonic()
-    check_folder(scene, config, folder, resume)
+    with_assets = "appearance" in stages
+    if scene.subtracts and with_assets:
+        if "geometry" not in stages:
+            raise UserError(f"{scene.path}: its regions subtract, and a cut learns no material; use --stage geometry")
+        say("the regions subtract: only the geometry stage runs, and the cut takes the base's material")
+        stages = ("geometry",)
+    with_geometry = "geometry" in stages and geometry_from is None
+    check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
     # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
-    guidance = _guidance(scene, config, say)
-    stage = GeometryStage(scene, config, guidance)
-    describe_run(scene, config, folder, command)
-    run_geometry(stage, folder, resume, quiet, say)
+    guidance = _guidance(scene, config, say) if with_geometry else None
+    for_appearance = prepare_appearance(scene, config, say) if "appearance" in stages else None
+    if with_geometry:
+        stage = GeometryStage(scene, config, guidance)
+        with discarded_without_checkpoint(folder):
+            describe_run(scene, config, folder, command)
+            run_stage(stage, folder, resume, quiet, say)
+    elif geometry_from is not None:
+        stage = load_finished_stage(scene, config, geometry_from)
+        describe_run(scene, config, folder, command)
+        take_geometry(geometry_from, folder)
+    else:
+        stage = load_finished_stage(scene, config, folder)
     metrics = export_geometry(stage, folder)
     metrics["seconds"] = round(time.monotonic() - started, 1)
     write_json(folder / "metrics.json", metrics)
+    if "appearance" in stages:
+        figures = run_appearance(scene, config, folder, for_appearance, resume, quiet, say)
+        metrics["appearance"] = figures
+        metrics["seconds"] = round(time.monotonic() - started, 1)
+        write_json(folder / "metrics.json", metrics)
+    if with_assets:
+        export_run(folder, ("glb", "mitsuba"), config.output.texture_size, say)
     return metrics
+
+
+def take_geometry(source: Path, folder: Path) -> None:
+    """Copy the newest geometry checkpoint of another run, which `load_finished_stage` has accepted."""
+    newest = list_checkpoints(checkpoint_folder(source, GeometryStage.name))[-1]
+    write_atomically(checkpoint_folder(folder, GeometryStage.name) / newest.name, newest.read_bytes())
 
 
 def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> GeometryStage:
     """The geometry stage of a run folder at its newest checkpoint, without guidance; UserError if there is none."""
     stage = GeometryStage(scene, config, None)
-    if not list_checkpoints(folder / "checkpoints"):
-        raise UserError(f"{folder / 'checkpoints'}: no checkpoint; run the geometry stage first")
-    done, _ = load_newest(folder / "checkpoints", STAGE, config.content_hash(), stage.field, stage.optimiser)
+    checkpoints = checkpoint_folder(folder, stage.name)
+    if not list_checkpoints(checkpoints):
+        raise UserError(f"{checkpoints}: no checkpoint; run the geometry stage first")
+    config_hash = config.content_hash(stage.name)
+    done, _ = load_newest(checkpoints, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
     if not done:
-        raise UserError(f"{folder / 'checkpoints'}: every checkpoint is damaged; run the geometry stage again")
+        raise UserError(f"{checkpoints}: every checkpoint is damaged; run the geometry stage again")
     return stage
 
 
@@ -74,18 +121,26 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
     scene, config, export = stage.scene, stage.config, folder / "export"
     with torch.no_grad():
         union = stage.surface()
-    parts = {name: stage.part_solid(name) for name in scene.parts}
-    for name, (vertices, faces) in parts.items():
-        if len(faces):
-            write_mesh(export / f"part_{name}.ply", vertices.numpy(), faces.numpy(), scene)
+    parts = {name: part_solid(stage, name) for name in scene.parts}
+    figures: dict[str, Any] = {}
+    if scene.subtracts:
+        cut = _cut(scene, parts)
+        figures = cut.figures
+        for name, data in cut.files().items():
+            write_atomically(export / name, data)
+        parts = _removed(scene, cut)
+    for name, solid in parts.items():
+        if len(solid.faces):
+            write_mesh(export / part_file(name), solid.vertices, solid.faces, scene)
+    write_json(export / "part.json", part_record(scene, parts))
     write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
     identical = copy_base(scene, export / "base")
-    whole = stage.part_solid(None)
+    # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
+    grown = tuple(tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
     base = scene.base_canonical
-    locality = measure_locality(
-        (whole[0].numpy(), whole[1].numpy()), (base.vertices, base.faces), scene.regions, config.geometry.focal_band
-    )
-    _write_turntable(stage, whole, folder)
+    locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
+    whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage, None)
+    _write_turntable(stage, (torch.from_numpy(whole.vertices), torch.from_numpy(whole.faces)), folder)
     return {
         "version": __version__,
         "prompt": scene.prompt,
@@ -94,9 +149,57 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
         "guidance_model": config.guidance.model,
         **asdict(locality),
         "base_identical": identical,
-        "part_faces": {name: len(faces) for name, (_, faces) in parts.items()},
+        "part_faces": {name: len(solid.faces) for name, solid in parts.items()},
+        "manifold": all(solid.manifold for solid in parts.values()),
+        "islands_removed": whole.islands_removed,
+        "bridged": whole.bridged,
+        "gap": whole.gap(base),
         "assembled_faces": len(union.faces),
+        **figures,
     }
+
+
+def export_run(
+    folder: Path,
+    formats: Collection[str],
+    texture_size: int,
+    say: Callable[[str], None] = print,
+    faces: int | None = None,
+) -> dict[str, Any]:
+    """Write the assets of a run, finished or interrupted, as of its newest checkpoint; see `export.assets`.
+
+    Args:
+        faces: at most so many triangles a part; None: all.
+
+    Raises:
+        UserError: no run or no checkpoint there, and see `export.assets.export_assets`.
+    """
+    scene, config = saved_run(folder)
+    stage = load_finished_stage(scene, config, folder)
+    if faces is not None and faces < LEAST_FACES:
+        raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
+    solids = {name: part_solid(stage, name) for name in scene.parts}
+    if faces is not None:
+        solids = {name: solid.decimated(faces) for name, solid in solids.items()}
+    cut = _cut(scene, solids) if scene.subtracts else None
+    if cut is not None:
+        solids = _removed(scene, cut)
+    appearance = finished_appearance(scene, config, folder)
+    values = None if appearance is None else appearance.field
+    parts = {
+        name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, values) for name, solid in solids.items()
+    }
+    write_json(folder / "export" / "part.json", part_record(scene, solids))
+    return export_assets(scene, config, parts, folder / "export", formats, texture_size, say, cut, faces)
+
+
+def _cut(scene: EditScene, solids: dict[str, Solid]) -> CutBase:
+    return cut_base(scene, SceneFile(scene.path, scene.parameters), solids)
+
+
+def _removed(scene: EditScene, cut: CutBase) -> dict[str, Solid]:
+    """What each part took away, in the canonical frame."""
+    return {name: solid.moved(scene.frame.matrix()) for name, solid in cut.removed.items()}
 
 
 def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tensor], folder: Path) -> None:
@@ -123,6 +226,21 @@ def _guidance(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -
         return None
     guidance = DiffusionGuidance.load(config.guidance)
     unknown = guidance.set_prompt(scene.prompt, scene.negative_prompt)
+    vocabulary = guidance.conventions.vocabulary
+    if vocabulary is not None and scene.subtracts:
+        raise UserError(
+            f"{scene.path}: its regions subtract, and the built-in prior knows only parts that are added; set "
+            "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
+        )
+    if vocabulary is not None:
+        reading = read_prompt(scene.prompt, vocabulary)
+        if not reading.parts:
+            hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
+            raise UserError(
+                f"prompt {scene.prompt!r}: the built-in prior knows no such part; nearest: {hint}; reword it "
+                "(`fd_mitsuba prior` lists the words), or set guidance.model to a Stable Diffusion folder or hub id"
+            )
+        unknown = list(reading.ignored)
     if unknown:
         verb = "is" if len(unknown) == 1 else "are"
         say(

@@ -21,6 +21,7 @@ from skimage.measure import marching_cubes  # noqa: E402
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS  # noqa: E402
 from fd_mitsuba.render import bridge  # noqa: E402
 from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
+from fd_mitsuba.render.vertex_normals import vertex_normals  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 SIZE = 32
@@ -225,6 +226,11 @@ def test_static_faces_change_nothing() -> None:
         mesh = (moved, faces, weight)
         expected = gradient(GeometryPass(SIZE), mesh, FOUR_VIEWS, 4)
         assert_same(gradient(view, mesh, FOUR_VIEWS, 4, static_faces=static), expected)
+        constant = int(faces[:static].max()) + 1
+        image, of_vertices, of_weight = gradient(
+            view, mesh, FOUR_VIEWS, 4, static_faces=static, static_vertices=constant
+        )
+        assert_same((image, of_vertices[constant:], of_weight), (expected[0], expected[1][constant:], expected[2]))
     assert view.static_builds == 1
     mesh = (vertices * 0.9, faces, weight)  # a broken promise
     expected = gradient(GeometryPass(SIZE), mesh, FOUR_VIEWS, 4)
@@ -249,7 +255,10 @@ def test_torch_and_dr_jit_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = torch.linspace(-1, 1, SIZE) + torch.linspace(0.2, 1.5, SIZE)[:, None]
     dr.backward(dr.sum(output * bridge.to_drjit(pattern.expand(5, 4, SIZE, SIZE))))
     assert_same((image.transpose(0, 1).reshape(-1),), (bridge.to_torch(dr.detach(output)),))
-    assert_same((vertices.reshape(-1), weight), tuple(bridge.to_torch(dr.grad(array)) for array in inputs))
+    direct, of_weight, of_normals = (bridge.to_torch(dr.grad(array)) for array in inputs)
+    attached = mesh[0].clone().requires_grad_()
+    (through_normals,) = torch.autograd.grad(vertex_normals(attached, mesh[1]), attached, of_normals.view(-1, 3))
+    assert_same((vertices, weight), (direct.view(-1, 3) + through_normals, of_weight))
 
 
 # Steadiness

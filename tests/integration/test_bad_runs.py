@@ -40,7 +40,17 @@ def call(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
 
 
 def run(scene: object, output: Path, *more: object) -> list[object]:
-    return ["run", scene, "-q", "-o", output, *[word for item in TINY for word in ("--set", item)], *more]
+    return [
+        "run",
+        scene,
+        "-q",
+        "--stage",
+        "geometry",
+        "-o",
+        output,
+        *[word for item in TINY for word in ("--set", item)],
+        *more,
+    ]
 
 
 def litter(folder: Path) -> list[Path]:

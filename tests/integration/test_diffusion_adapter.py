@@ -530,7 +530,7 @@ def test_half_precision_files_are_found(folders: dict[str, Path], tmp_path: Path
 
 
 def test_builtin_is_a_folder_like_any_other(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loading, "builtin_folder", lambda: builtin.builtin_folder(folders["ip2p"]))
+    monkeypatch.setattr(loading, "builtin_folder", lambda _: builtin.builtin_folder(folders["ip2p"]))
     assert DiffusionGuidance.load(GuidanceConfig()).needs_base
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,10 +11,11 @@ import pytest
 import torch
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.edit_scene import load_edit_scene
-from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage, StepRecord
+from fd_mitsuba.training.loop import run_stage
 
 
 class PullMask:
@@ -93,6 +96,28 @@ def test_a_part_that_vanishes_stops_the_run(stage: Callable[..., GeometryStage])
         for step in range(60):
             shrinker.step(step)
             shrinker.check_field(step)
+
+
+def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., GeometryStage], tmp_path: Path) -> None:
+    def run(first: int, resume: bool) -> list[int]:
+        """The steps that were taken until the part had been invisible for too long, or a signal came."""
+        blind, taken = stage(+1.0, lambda_focal=0.0, steps=60), []
+        real = blind.step
+
+        def step(number: int) -> StepRecord:
+            taken.append(number)
+            if number == first:
+                os.kill(os.getpid(), signal.SIGINT)
+            return real(number)
+
+        blind.step = step  # type: ignore[method-assign]
+        blind._render = lambda *_: torch.zeros(2, 5, 24, 24, requires_grad=True)  # type: ignore[method-assign]
+        with pytest.raises(RunStopped if resume else Interrupted):
+            run_stage(blind, tmp_path, resume, quiet=True, say=lambda _: None)
+        return taken
+
+    assert run(9, resume=False) == list(range(10))
+    assert run(-1, resume=True) == list(range(10, VANISHED_AFTER))
 
 
 def test_a_field_that_is_not_finite_stops_the_run(stage: Callable[..., GeometryStage]) -> None:

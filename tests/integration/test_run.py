@@ -26,6 +26,7 @@ from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.cli import main
 from fd_mitsuba.config import load_config
+from fd_mitsuba.export.part_solid import part_solid
 from fd_mitsuba.pipeline import load_finished_stage
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
@@ -75,7 +76,22 @@ def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
 def arguments(place: Path, output: str, *more: str) -> list[str]:
     model = f"guidance.model={place / 'sd15'}"
     scene, settings = str(place / "scene.xml"), str(place / "tiny.toml")
-    return ["run", scene, "-c", settings, "--set", model, "-o", str(place / output), "-t", "1", "-q", *more]
+    return [
+        "run",
+        scene,
+        "-c",
+        settings,
+        "--set",
+        model,
+        "-o",
+        str(place / output),
+        "-t",
+        "1",
+        "-q",
+        "--stage",
+        "geometry",
+        *more,
+    ]
 
 
 def start(place: Path, output: str, *more: str) -> subprocess.Popen[str]:
@@ -195,7 +211,7 @@ def test_finished_stage_can_be_loaded(finished: Path, place: Path) -> None:
     config = load_config(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
     stage = load_finished_stage(scene, config, finished)
     metrics = json.loads((finished / "metrics.json").read_text())
-    assert len(stage.part_solid("part")[1]) == metrics["part_faces"]["part"]
+    assert len(part_solid(stage, "part").faces) == metrics["part_faces"]["part"]
 
 
 def test_interrupted_and_resumed_gives_the_same_bytes(finished: Path, place: Path) -> None:
@@ -265,6 +281,31 @@ def test_second_signal_ends_at_once_and_can_be_resumed(place: Path) -> None:
         _, errors = process.communicate(timeout=60)
     assert process.returncode in (130, -signal.SIGINT) and "Traceback" not in errors
     assert list_checkpoints(place / "twice" / "checkpoints")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_before_the_first_step(place: Path, number: signal.Signals) -> None:
+    output = f"early_{number.name}"
+    with started(place, output) as process:
+        time.sleep(random.uniform(0.6, 2.5))  # among the imports
+        assert not (place / output / "metrics.jsonl").exists()
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "fd_mitsuba: interrupted; continue with --resume\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_during_the_export(place: Path, number: signal.Signals) -> None:
+    output = f"export_{number.name}"
+    more = (*LONG[:2], "--set", "output.turntable_frames=150")
+    with started(place, output, *more) as process:
+        wait_for(process, lambda: (place / output / "export" / "assembled.ply").exists())
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "fd_mitsuba: interrupted; continue with --resume\n")
+    assert not (place / output / "metrics.json").exists()
+    finish(place, output, "--resume", *more)
+    assert (place / output / "metrics.json").exists()
 
 
 # From here on within this process: Mitsuba is there already, so that a run takes a second.
@@ -375,9 +416,20 @@ def test_part_that_vanishes_stops_the_run_and_keeps_the_checkpoint(
     more = ["geometry.lambda_sds=0", "geometry.lambda_focal=0", "geometry.lambda_collision=0"]
     more += ["geometry.lambda_volume=10", "geometry.learning_rate=0.01", "geometry.steps=200"]
     assert run_here(place, "gone", *[word for item in more for word in ("--set", item)]) == 1
-    assert "vanished" in one_error(capsys)
-    assert list_checkpoints(place / "gone" / "checkpoints")
+    error = one_error(capsys)
+    step = int(list_checkpoints(place / "gone" / "checkpoints")[-1].stem[5:])
+    assert "vanished" in error and f"gone keeps the state after step {step}: try other settings" in error
     assert not (place / "gone" / "export").exists()
+
+
+def test_part_that_vanishes_at_once_leaves_no_folder(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    more = ["geometry.lambda_sds=0", "geometry.lambda_focal=0", "geometry.lambda_collision=0"]
+    more += ["geometry.lambda_volume=10", "geometry.learning_rate=0.03", "output.checkpoint_every=500"]
+    words = [word for item in [*more, "geometry.steps=200"] for word in ("--set", item)]
+    for _ in range(2):  # the same command can be repeated
+        assert run_here(place, "nothing", *words) == 1
+        assert "no step was kept, so the same -o can be used again" in one_error(capsys)
+        assert not (place / "nothing").exists()
 
 
 def test_mitsuba_itself_opens_the_scene_after_register(place: Path) -> None:

@@ -9,13 +9,15 @@ import pytest
 from conftest import BASE, write_ply
 from PIL import Image
 
-from fd_mitsuba.check import check_scene, estimate_cost
-from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig
+from fd_mitsuba.check import START_AND_EXPORT_SECONDS, check_scene, estimate_cost
+from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig, load_config
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.memory import working_set_bytes
 from fd_mitsuba.preview import preview_scene, region_colours
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
 Make = Callable[..., Path]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def ball(scale: str, x: float, y: float, z: float, part: str = "part") -> str:
@@ -43,6 +45,10 @@ def test_report_as_json_and_lines(make_scene: Make) -> None:
     data = json.loads(json.dumps(report.to_json()))
     assert data["base"][0]["topology"]["closed"] is True and data["regions"][0]["name"] == "wing"
     assert data["cost"]["seconds_total"] > 0
+    # A cube in the scene's units, 7/6 of the longest side of the base, around the base's centre.
+    low, high = np.array(data["grid_low"]), np.array(data["grid_high"])
+    assert high - low == pytest.approx([report.longest_side * 7 / 6] * 3, rel=1e-5)
+    assert any(line.startswith("grid ") and f"x {low[0]:.4g} to {high[0]:.4g}" in line for line in report.lines())
     assert all(isinstance(line, str) and "\n" not in line for line in report.lines())
 
 
@@ -96,8 +102,35 @@ def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
     large = estimate_cost(scene, RunConfig(guidance=GuidanceConfig(model="somebody/stable-diffusion")))
     assert fine.active_vertices == pytest.approx(8 * default.active_vertices, rel=0.1)
     assert fine.seconds_per_step > default.seconds_per_step
-    assert short.seconds_total == pytest.approx(default.seconds_total / 10)
+    fixed = START_AND_EXPORT_SECONDS
+    assert short.seconds_total - fixed == pytest.approx((default.seconds_total - fixed) / 10)
+    without = estimate_cost(scene, RunConfig(geometry=GeometryConfig(lambda_sds=0)))
+    assert without.seconds_per_step < 0.1 and without.memory_mb < default.memory_mb
     assert large.seconds_per_step > 10 * default.seconds_per_step and large.memory_mb > default.memory_mb + 3000
+
+
+@pytest.mark.parametrize(
+    ("more", "seconds", "megabytes"),
+    [
+        (["geometry.coarse_fraction=1.0"], 0.28, 1080),
+        (["geometry.coarse_fraction=1.0", "geometry.grid_resolution=128"], 0.42, 1240),
+        (["geometry.coarse_fraction=0.0"], 0.7, 1170),
+    ],
+)
+def test_cost_of_runs_that_were_measured(more: list[str], seconds: float, megabytes: float) -> None:
+    scene = load_edit_scene(ROOT / "scenes" / "pegasus" / "scene.xml")
+    cost = estimate_cost(scene, load_config(ROOT / "configs" / "quick.toml", more))
+    assert cost.seconds_per_step == pytest.approx(seconds, rel=0.3)
+    assert cost.memory_mb == pytest.approx(megabytes, rel=0.2)
+
+
+def test_memory_of_stable_diffusion_is_what_loading_it_demands(make_scene: Make) -> None:
+    config = load_config(ROOT / "configs" / "paper.toml")
+    cost = estimate_cost(load_edit_scene(make_scene()), config)
+    unet = {"block_out_channels": [320, 640, 1280, 1280]}
+    vae = {"block_out_channels": [128, 256, 512, 512], "layers_per_block": 2}
+    demanded = 4 * (860e6 + 123e6 + 84e6) + working_set_bytes(unet, vae, 64, 4, "float32")
+    assert 1 <= cost.memory_mb / (demanded / 1e6) < 1.2
 
 
 def test_preview_shows_base_and_region(make_scene: Make, tmp_path: Path) -> None:
@@ -112,6 +145,18 @@ def test_preview_shows_base_and_region(make_scene: Make, tmp_path: Path) -> None
     assert orange.sum() > 40 and grey.sum() > 150
     rows_of = lambda mask: np.nonzero(mask)[0].mean()  # noqa: E731
     assert rows_of(orange) < rows_of(grey)  # the region is above the body
+
+
+def test_preview_is_not_grainy(make_scene: Make, tmp_path: Path) -> None:
+    base = BASE.replace('<bsdf type="diffuse"/>', '<bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>')
+    light = """<emitter type="constant"/><emitter type="point"><point name="position" x="1" y="2" z="2"/></emitter>"""
+    scene = load_edit_scene(make_scene(base=base, light=light, region=ball("0.05", 0, 0.35, 0)))
+    (path,) = preview_scene(scene, tmp_path / "out", views=1, size=128)
+    tile = np.asarray(Image.open(path).convert("RGB")).astype(float)[-168:-40, 16:144, 2] / 255
+    body = tile[45:75, 45:83]
+    # What an average over the neighbours takes away is grain: the body itself is smooth but for a few edges.
+    around = sum(np.roll(body, shift, axis) for shift in (-1, 1) for axis in (0, 1)) / 4
+    assert np.median(np.abs(body - around)[1:-1, 1:-1]) < 0.008
 
 
 def test_preview_without_light_and_into_a_file(make_scene: Make, tmp_path: Path) -> None:

@@ -27,6 +27,9 @@ def test_defaults_are_the_papers() -> None:
     geometry = config.geometry
     assert (geometry.steps, geometry.learning_rate, geometry.union_k, geometry.views) == (3000, 1e-3, 0.15, 4)
     assert config.guidance.guidance_scale == 100.0
+    appearance = config.appearance
+    assert (appearance.steps, appearance.learning_rate, appearance.timestep_range) == (2000, 1e-2, (0.02, 0.98))
+    assert (appearance.lambda_style, appearance.lambda_boundary, config.texture.hidden) == (10, 100, 32)
 
 
 @pytest.mark.parametrize("name", ["paper", "quick", "smoke"])
@@ -81,7 +84,48 @@ def test_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
     assert str(path) in message and "output.sheet_every" in message
 
 
-@pytest.mark.parametrize("override", ["geometry.steps", "=3", "geometry.steps.more.x", ""])
+@pytest.mark.parametrize(
+    "override",
+    [
+        "geometry.steps=many",
+        "geometry.betas=[0.9, 2]",
+        "guidance.timestep_range_coarse=[0.5, 0.2]",
+        "geometry.step=3",
+        "geometri.steps=3",
+        "geometry.steps = 2.5",
+    ],
+)
+def test_bad_override_is_blamed_itself_and_not_the_file(tmp_path: Path, override: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("[geometry]\nsteps = 7\n")
+    message = refusal(path, "seed=1", override, "geometry.views=2")
+    assert message.startswith(f"--set {override}: ") and str(path) not in message
+
+
+def test_bad_value_of_the_file_is_not_blamed_on_an_override(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("[geometry]\nsteps = 0\n")
+    assert refusal(path, "geometry.views=2").startswith(f"{path}: geometry.steps")
+    path.write_text("[guidance]\ntimestep_range_coarse = [0.5, 0.2]\n")
+    assert refusal(path, "geometry.views=2").startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("override", ["geometry.steps = 200", " geometry . steps=200 ", "geometry.steps= 200"])
+def test_blanks_in_an_override(override: str) -> None:
+    assert load_config(None, [override]).geometry.steps == 200
+
+
+def test_unknown_section_names_sections() -> None:
+    message = refusal(None, "geometri.steps=3")
+    assert "nearest: geometry" in message and "geometry.views" not in message
+
+
+def test_values_that_do_not_fit_together_are_told_in_our_own_words() -> None:
+    message = refusal(None, "cameras.fov_deg=[50, 40]")
+    assert message.endswith("cameras.fov_deg = (50.0, 40.0) must be ordered and lie in [1, 150]; change the value")
+
+
+@pytest.mark.parametrize("override", [" = 3", "geometry.steps", "=3", "geometry.steps.more.x", ""])
 def test_override_that_is_none(override: str) -> None:
     assert "section.key=value" in refusal(None, override)
 

@@ -11,8 +11,9 @@ import fd_mitsuba
 
 ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
-    "conventions errors config mitsuba_api threads scene fields extraction render guidance losses training export "
-    "evaluation prior check preview doctor pipeline cli __main__"
+    "conventions errors config_sections config mitsuba_api threads scene fields extraction render guidance losses "
+    "training export evaluation prior check preview doctor appearance pipeline parts cli_options "
+    "cli_export cli_prior cli __main__"
 ).split()
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
 

@@ -15,7 +15,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import Interrupted, RunStopped
 from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.geometry_stage import StepRecord
-from fd_mitsuba.training.loop import run_geometry
+from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.record import read_metrics
 
 
@@ -28,6 +28,8 @@ class CountingStage:
         self.field = torch.nn.Linear(1, 1)
         self.optimiser = torch.optim.SGD(self.field.parameters(), lr=1.0)
         self.at = at or {}
+        self.counters = {"steps": 0}
+        self.name, self.steps = "geometry", steps
         with torch.no_grad():
             self.field.weight.zero_()
 
@@ -38,11 +40,12 @@ class CountingStage:
         elif event is not None:
             raise event
 
-    def phase_of(self, step: int) -> tuple[str, int, int]:
-        return "coarse", step, self.config.geometry.steps
+    def phase_name(self, step: int) -> str:
+        return "coarse"
 
     def step(self, step: int) -> StepRecord:
         self.happen("step", step)
+        self.counters["steps"] += 1
         with torch.no_grad():
             self.field.weight += 1
         return StepRecord({"loss": 0.0}, torch.zeros(0), None)
@@ -54,7 +57,7 @@ class CountingStage:
 
 def go(stage: CountingStage, folder: Path, resume: bool = False) -> list[str]:
     said: list[str] = []
-    run_geometry(stage, folder, resume, quiet=True, say=said.append)  # type: ignore[arg-type]
+    run_stage(stage, folder, resume, quiet=True, say=said.append)  # type: ignore[arg-type]
     return said
 
 
@@ -85,6 +88,7 @@ def test_signal_ends_after_a_checkpoint_wherever_it_comes(
     stage = CountingStage()
     assert go(stage, tmp_path, resume=True) == [f"resuming after step {stops_after} of 6"]
     assert float(stage.field.weight.detach()) == 6 and saved(tmp_path)[-1] == 6
+    assert stage.counters == {"steps": 6}
     assert [row["step"] for row in read_metrics(tmp_path / "metrics.jsonl")] == list(range(1, 7))
 
 

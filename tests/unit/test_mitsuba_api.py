@@ -44,6 +44,19 @@ def test_takes_the_newest_and_dr_jit_uses_it() -> None:
     assert (result.returncode, result.stdout.strip(), result.stderr) == (0, "6.0", "")
 
 
+@pytest.mark.parametrize("first", ["mi.set_variant('llvm_ad_rgb'); import fd_mitsuba", "import fd_mitsuba"])
+def test_plugins_are_known_once_the_package_is_imported_after_mitsuba(first: str) -> None:
+    llvm = str(mitsuba_api.find_llvm().path)
+    load = "type(mi.load_dict({'type': 'dual_path'})).__name__"
+    code = f"import mitsuba as mi; {first}; mi.set_variant('llvm_ad_rgb'); one = {load}; "
+    result = run(code + f"mi.set_variant('llvm_ad_mono'); print(one, {load})", DRJIT_LIBLLVM_PATH=llvm)
+    assert (result.returncode, result.stdout.split()) == (0, ["DualPath", "DualPath"]), result.stderr
+
+
+def test_importing_the_package_alone_leaves_mitsuba_alone() -> None:
+    assert run("import fd_mitsuba, sys; print('mitsuba' in sys.modules)").stdout.strip() == "False"
+
+
 def test_importing_the_renderer_first_is_safe_too() -> None:
     code = "from fd_mitsuba.render.geometry_pass import GeometryPass; GeometryPass(4); import drjit as dr\n"
     assert run(code + "print(dr.detail.llvm_version()[0] >= 16)").stdout.strip() == "True"

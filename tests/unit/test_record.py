@@ -13,7 +13,8 @@ from PIL import Image
 
 from fd_mitsuba.evaluation.turntable import write_sheet, write_video
 from fd_mitsuba.training.geometry_stage import StepRecord
-from fd_mitsuba.training.record import Recorder, normal_pictures, read_metrics
+from fd_mitsuba.training.record import Recorder, read_metrics
+from fd_mitsuba.training.sheets import normal_pictures
 
 
 def write(folder: Path, first: int, last: int, done: int = 0) -> None:
@@ -74,6 +75,12 @@ def test_plain_line_at_the_end_where_there_is_no_terminal(tmp_path: Path, capfd:
     assert out == "" and "refined 2/2" in err and "sds 2" in err and "\x1b" not in err
 
 
+def test_plain_line_is_not_broken(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with Recorder(tmp_path, "geometry", 1) as recorder:
+        recorder.row(1, "coarse", {"loss_sds": 1.1e-5, "loss_focal": 2e-5, "loss_collision": 3e-5, "volume_ratio": 0.5})
+    assert capfd.readouterr().err.count("\n") == 1
+
+
 def test_missing_file_has_no_rows(tmp_path: Path) -> None:
     assert read_metrics(tmp_path / "none.jsonl") == []
 
@@ -89,7 +96,7 @@ def test_colours_of_normals() -> None:
 def test_contact_sheet(tmp_path: Path, preview: torch.Tensor | None) -> None:
     record = StepRecord({}, torch.zeros(2, 5, 16, 16), preview)
     with Recorder(tmp_path, "geometry", 10, quiet=True) as recorder:
-        path = recorder.sheet(3, record)
+        path = recorder.sheet(3, record.sheet())
     with Image.open(path) as picture:
         width, height = picture.size
     assert path == tmp_path / "images" / "step_000003.png"

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from fd_mitsuba.config import RunConfig, load_config
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
-from fd_mitsuba.training.run_folder import check_folder, describe_run
+from fd_mitsuba.training.run_folder import check_folder, describe_run, discarded_without_checkpoint
 
 Make = Callable[..., Path]
 CONFIG = RunConfig()
@@ -87,6 +87,45 @@ def test_parameters_belong_to_the_run(make_scene: Make, tmp_path: Path) -> None:
     check_folder(load_edit_scene(path, {"words": "x"}), CONFIG, tmp_path / "out", resume=True)
     with pytest.raises(UserError, match="other parameters"):
         check_folder(load_edit_scene(path, {"words": "y"}), CONFIG, tmp_path / "out", resume=True)
+
+
+@pytest.mark.parametrize("error", [UserError("no"), RunStopped("no"), OSError(28, "no space")])
+def test_error_before_the_first_checkpoint_leaves_nothing(scene: EditScene, tmp_path: Path, error: Exception) -> None:
+    folder = tmp_path / "out"
+    with pytest.raises(type(error)), discarded_without_checkpoint(folder):
+        describe_run(scene, CONFIG, folder, "command")
+        (folder / "metrics.jsonl").write_text("{}")
+        (folder / ".step_000001.safetensors.1.tmp").write_text("")
+        raise error
+    assert not folder.exists()
+
+
+def test_error_in_a_folder_with_files_of_others_takes_only_the_runs(scene: EditScene, tmp_path: Path) -> None:
+    with pytest.raises(UserError), discarded_without_checkpoint(tmp_path):
+        describe_run(scene, CONFIG, tmp_path, "command")
+        (tmp_path / "thesis.tex").write_text("precious")
+        raise UserError("no")
+    assert (tmp_path / "thesis.tex").exists() and not (tmp_path / "run.json").exists()
+
+
+@pytest.mark.parametrize("error", [RunStopped("it vanished; do less"), Interrupted("SIGINT"), UserError("full")])
+def test_error_after_a_checkpoint_leaves_the_run(scene: EditScene, tmp_path: Path, error: Exception) -> None:
+    folder = tmp_path / "out"
+    with pytest.raises(type(error)) as caught, discarded_without_checkpoint(folder):
+        describe_run(scene, CONFIG, folder, "command")
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "step_000100.safetensors").write_text("")
+        raise error
+    check_folder(scene, CONFIG, folder, resume=True)
+    words = f"it vanished; do less; {folder} keeps the state after step 100: "
+    assert str(caught.value).startswith(words if isinstance(error, RunStopped) else str(error))
+
+
+def test_interrupted_before_the_first_checkpoint_can_be_resumed(scene: EditScene, tmp_path: Path) -> None:
+    with pytest.raises(Interrupted), discarded_without_checkpoint(tmp_path / "out"):
+        describe_run(scene, CONFIG, tmp_path / "out", "command")
+        raise Interrupted("SIGINT")
+    check_folder(scene, CONFIG, tmp_path / "out", resume=True)
 
 
 def test_files_of_the_same_name_are_all_kept(tmp_path: Path, make_scene: Make) -> None:

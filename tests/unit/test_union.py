@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fd_mitsuba.fields.union import soft_union
+from fd_mitsuba.fields.union import soft_subtract, soft_union
 
 
 def pairs(count: int = 500) -> tuple[torch.Tensor, torch.Tensor]:
@@ -54,3 +54,12 @@ def test_the_fillet_sets_in_without_a_kink():
     part = torch.tensor([-0.15 - 1e-6, -0.15 + 1e-6], dtype=torch.float64, requires_grad=True)
     soft_union(torch.zeros(2, dtype=torch.float64), part, 0.15).sum().backward()
     assert (part.grad[1] - part.grad[0]).abs() < 1e-5
+
+
+def test_soft_subtract_by_hand_and_as_the_union_of_the_outsides() -> None:
+    base, part = torch.tensor([0.3, 0.1, 0.02, -0.2, 0.5]), torch.tensor([-0.5, 0.1, -0.04, -0.3, 0.2])
+    # h = 0.1 - |base + part| is 0, 0, 0.08, 0, 0: only the third is near the cut's edge.
+    expected = torch.tensor([0.3, -0.1, 0.02 - 0.1 * 0.08**2 / 0.1, -0.2, -0.2])
+    torch.testing.assert_close(soft_subtract(base, part, 0.1), expected)
+    torch.testing.assert_close(soft_subtract(base, part, 0.0), torch.minimum(base, -part))
+    torch.testing.assert_close(-soft_subtract(base, part, 0.3), soft_union(-base, part, 0.3))

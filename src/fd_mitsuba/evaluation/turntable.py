@@ -12,7 +12,8 @@ from PIL import Image, ImageDraw
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.checkpoint import write_atomically
-from fd_mitsuba.training.record import normal_pictures, write_picture
+from fd_mitsuba.training.record import write_picture
+from fd_mitsuba.training.sheets import normal_pictures
 
 Mesh = tuple[torch.Tensor, torch.Tensor]
 

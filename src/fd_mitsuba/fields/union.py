@@ -29,3 +29,21 @@ def soft_union(sdf_base: Tensor, sdf_part: Tensor, k: float, only_outside: bool 
     if only_outside:
         overlap = torch.where(larger < 0, overlap, 0.0)
     return larger + 0.1 / k * overlap * overlap
+
+
+def soft_subtract(sdf_base: Tensor, sdf_part: Tensor, k: float) -> Tensor:
+    """The signed distance of the base without the part, with a fillet of width `k` along the edge of the cut.
+
+        soft_subtract = min(sdf_base, -sdf_part) - 0.1 h^2 / k,   h = max(k - |sdf_base + sdf_part|, 0)
+
+    The outside of the result is the soft union of the base's outside and the part, so this is `soft_union` with all
+    three turned inside out. Exactly `sdf_base` where `-sdf_part` is higher by `k` or more.
+
+    Args:
+        sdf_base: any shape, inside positive, canonical units.
+        sdf_part: same shape.
+        k: width of the fillet in canonical units, >= 0.
+
+    Gradients flow to both, with the kink of `soft_union`.
+    """
+    return -soft_union(-sdf_base, sdf_part, k)

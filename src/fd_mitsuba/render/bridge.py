@@ -6,8 +6,11 @@ function on copies of torch tensors and appears to torch as one differentiable o
 
 from __future__ import annotations
 
+import atexit
 import threading
+import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -31,6 +34,11 @@ def to_torch(array: mi.Float) -> torch.Tensor:
     return array.torch().clone()
 
 
+def indices_to_torch(array: mi.UInt32) -> torch.Tensor:
+    """A flat int64 torch copy of evaluated whole numbers below 2^31."""
+    return mi.Int32(array).torch().to(torch.int64)
+
+
 def differentiable(function: DrJitFunction, *tensors: torch.Tensor) -> torch.Tensor:
     """`function` of torch tensors: flat float32, with gradients to every tensor that requires them.
 
@@ -48,6 +56,24 @@ def differentiable(function: DrJitFunction, *tensors: torch.Tensor) -> torch.Ten
         return to_torch(function(*(to_drjit(tensor) for tensor in tensors)))
 
 
+@dataclass(eq=False)
+class _Traced:
+    """What a backward pass will need of Dr.Jit."""
+
+    inputs: list[mi.Float]
+    output: mi.Float | None
+
+
+_LIVE: weakref.WeakSet[_Traced] = weakref.WeakSet()
+
+
+@atexit.register
+def _release() -> None:
+    """A torch graph that outlives Dr.Jit, as one held by a global name does, would crash the process as it ends."""
+    for traced in list(_LIVE):
+        traced.inputs, traced.output = [], None
+
+
 class _Crossing(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, function: DrJitFunction, *tensors: torch.Tensor) -> torch.Tensor:
@@ -58,7 +84,8 @@ class _Crossing(torch.autograd.Function):
                     dr.enable_grad(array)
             output = function(*inputs)
             dr.eval(output)
-            ctx.inputs, ctx.output = inputs, output
+            ctx.traced = _Traced(inputs, output)
+            _LIVE.add(ctx.traced)
             ctx.like = [(tensor.shape, tensor.dtype) for tensor in tensors]
             return to_torch(dr.detach(output))
 
@@ -66,15 +93,16 @@ class _Crossing(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         with _LOCK:
-            wanted = [array for array in ctx.inputs if dr.grad_enabled(array)]
+            inputs, output = ctx.traced.inputs, ctx.traced.output
+            wanted = [array for array in inputs if dr.grad_enabled(array)]
             dr.clear_grad(wanted)
-            if dr.grad_enabled(ctx.output):  # false where nothing was seen
-                dr.set_grad(ctx.output, to_drjit(gradient))
-                dr.enqueue(dr.ADMode.Backward, ctx.output)
+            if dr.grad_enabled(output):  # false where nothing was seen
+                dr.set_grad(output, to_drjit(gradient))
+                dr.enqueue(dr.ADMode.Backward, output)
                 # Edges stay for a second backward; they are freed with this node when torch drops its graph.
                 dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             results: list[torch.Tensor | None] = []
-            for array, (shape, dtype) in zip(ctx.inputs, ctx.like, strict=True):
+            for array, (shape, dtype) in zip(inputs, ctx.like, strict=True):
                 if dr.grad_enabled(array):
                     results.append(to_torch(dr.grad(array)).reshape(shape).to(dtype))
                 else:

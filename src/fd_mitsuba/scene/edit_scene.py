@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,20 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.conventions import BASE_NAME, DEFAULT_PART_NAME, GRID_HALF_EXTENT
+from fd_mitsuba.conventions import BASE_NAME, GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.edit_inputs import EditInputs
+from fd_mitsuba.scene.enclosure import encloses_volume
+from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
 from fd_mitsuba.scene.normalisation import Normalisation
-from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION, region_triangles
+from fd_mitsuba.scene.part_names import part_names
+from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
+from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
+from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
 LEAST_SHARE_IN_GRID = 0.5
 """A region with less of its volume than this in the grid cube is an error; a smaller overhang is a warning."""
-
-_PART_NAME = re.compile(r"\w[\w.-]{0,63}")
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,19 @@ class EditScene:
 
     Attributes:
         path: the scene file.
-        parameters: the `-D` values that it was read with.
+        parameters: the `-D` values that the scene file was read with.
         prompt: what the edited object shall look like; never blank.
         base_prompt: what the base looks like, "" if not given.
         negative_prompt: what to keep away from, "" if not given.
         base: the base's meshes in the user frame, after their `to_world`.
         regions: the focal regions, in the canonical frame.
         frame: the map between the two frames.
-        files: every file that the scene reads, the scene file and its includes first.
+        files: every file that is read, the scene file and its includes first.
         has_light: whether the scene has an emitter of any kind.
-        has_part_bsdf: whether it has a top-level BSDF with the id "part".
+        has_part_bsdf: whether there is a top-level BSDF with the id "part".
+        regions_path: the file of regions beside the scene; None: the scene says itself.
+        regions_parameters: the `-D` values that it was read with.
+        earlier: the parts of earlier rounds, which are among the meshes of `base`.
     """
 
     path: Path
@@ -55,12 +60,20 @@ class EditScene:
     files: tuple[Path, ...] = ()
     has_light: bool = False
     has_part_bsdf: bool = False
+    regions_path: Path | None = None
+    regions_parameters: dict[str, str] = field(default_factory=dict)
+    earlier: tuple[StackedPart, ...] = ()
 
     @property
     def parts(self) -> dict[str, tuple[FocalRegion, ...]]:
         """Part name -> its regions, in the order of the scene file."""
         names = dict.fromkeys(region.part for region in self.regions)
         return {name: tuple(region for region in self.regions if region.part == name) for name in names}
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether the parts are cut out of the base instead of added; all regions agree."""
+        return self.regions[0].mode == SUBTRACT
 
     @cached_property
     def base_soup(self) -> TriangleMesh:
@@ -73,53 +86,87 @@ class EditScene:
         soup = self.base_soup
         return TriangleMesh(BASE_NAME, self.frame.to_canonical(soup.vertices), soup.faces, soup.source_files)
 
+    def inputs(self) -> EditInputs:
+        """The files that the scene was read from, parsed again."""
+        return EditInputs.open(self.path, self.regions_parameters | self.parameters, self.regions_path)
+
     def mitsuba_scene(self, without: tuple[str, ...] = ()) -> Any:
         """The scene file as an `mi.Scene` in the user frame; see `SceneFile.instantiate`."""
         return SceneFile(self.path, self.parameters).instantiate(without)
 
 
-def load_edit_scene(path: Path | str, parameters: dict[str, str] | None = None) -> EditScene:
+def load_edit_scene(
+    path: Path | str,
+    parameters: dict[str, str] | None = None,
+    regions: Path | str | None = None,
+    prompt: str | None = None,
+) -> EditScene:
     """Read a scene file, check it, and load it once in Mitsuba so that later loading cannot fail.
 
     Args:
         path: the XML file.
         parameters: values for `$name`, as given with `-D name=value`.
+        regions: an XML file whose focal regions, `dual_path` integrator and `<bsdf id="part">` are taken too, in the
+            frame of the scene.
+        prompt: takes the place of the integrator's; a scene without `dual_path`, as an exported one, needs it.
 
     Raises:
         UserError: any input that cannot be edited, in one line with file, element and remedy.
     """
-    file = SceneFile(path, parameters)
-    prompts = _prompts(file)
-    base = tuple(_base_mesh(file, element) for element in file.top_level("shape") if element.plugin != FOCAL_REGION)
+    inputs = EditInputs.open(Path(path), parameters or {}, None if regions is None else Path(regions))
+    file = inputs.scene
+    base = tuple(_base_mesh(file, element) for element in base_elements(file))
+    earlier = earlier_parts(file.path, base)
+    latest = max(earlier, key=lambda part: part.round, default=None)
+    prompts = inputs.prompts(prompt, "" if latest is None else latest.prompt)
     if not base:
         raise UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
     frame = _frame(file, base)
-    elements = [element for element in file.top_level("shape") if element.plugin == FOCAL_REGION]
+    elements = inputs.region_elements()
     if not elements:
-        raise UserError(f'{file.path}: no focal region; add <shape type="focal_region" id="..."> where to edit')
-    regions = tuple(_region(file, element, index, frame) for index, element in enumerate(elements))
+        remedy = 'add <shape type="focal_region" id="..."> where to edit, or give a file with it by --regions'
+        raise UserError(f"{inputs.sources[-1].path}: no focal region; {remedy}")
+    names = part_names([element for _, element in elements], earlier)
+    found = tuple(
+        _region(owner, element, index, names[index], frame) for index, (owner, element) in enumerate(elements)
+    )
     soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
     distance = MeshDistance(soup.vertices, soup.faces)
-    for element, region in zip(elements, regions, strict=True):
-        gap = gap_to_base(region, distance, soup)
+    gaps = [gap_to_base(region, distance, soup) for region in found]
+    for (_, element), region, gap in zip(elements, found, gaps, strict=True):
         if gap > region.size:
             away = f"the region is {gap / frame.scale:.3g} away from the base, more than its own size"
             raise element.error(f"{away}; move it closer")
-    file.instantiate()
-    files = tuple(dict.fromkeys([*file.text.files, *file.files.values()]))
+    check_modes([element for _, element in elements], found, base, frame, gaps)
+    for source in inputs.sources:
+        source.instantiate()
+    folder = file.path.parent
+    record = [folder / RECORD_NAME, *(part.normal_path(folder) for part in earlier)] if earlier else []
     return EditScene(
         path=file.path,
         prompt=prompts[0],
         base=base,
-        regions=regions,
+        regions=found,
         frame=frame,
         base_prompt=prompts[1],
         negative_prompt=prompts[2],
         parameters=file.parameters,
-        files=files,
+        files=(*inputs.files, *(path for path in record if path is not None and path.is_file())),
         has_light=any(element.kind == "emitter" for element in file.elements),
-        has_part_bsdf=any(element.id == DEFAULT_PART_NAME for element in file.top_level("bsdf")),
+        has_part_bsdf=inputs.part_bsdf()[1] is not None,
+        regions_path=inputs.regions.path if inputs.regions else None,
+        regions_parameters=inputs.regions.parameters if inputs.regions else {},
+        earlier=earlier,
     )
+
+
+def base_elements(file: SceneFile) -> list[SceneElement]:
+    """The shapes that make up the base, in file order: those that are neither regions nor area lights."""
+
+    def emits(element: SceneElement) -> bool:
+        return any(file.elements[child].kind == "emitter" for child in element.children.values())
+
+    return [item for item in file.top_level("shape") if item.plugin != FOCAL_REGION and not emits(item)]
 
 
 def _soup(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:
@@ -127,23 +174,6 @@ def _soup(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:
     faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
     sources = tuple(dict.fromkeys(source for mesh in meshes for source in mesh.source_files))
     return TriangleMesh(BASE_NAME, np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), sources)
-
-
-def _prompts(file: SceneFile) -> tuple[str, str, str]:
-    integrators = [element for element in file.top_level("integrator") if element.plugin == DUAL_PATH]
-    if not integrators:
-        raise UserError(f'{file.path}: no <integrator type="{DUAL_PATH}">; add it with <string name="prompt" .../>')
-    if len(integrators) > 1:
-        raise integrators[1].error("there are several; keep one")
-    values = []
-    for name in ("prompt", "base_prompt", "negative_prompt"):
-        value = integrators[0].properties.get(name, "")
-        if not isinstance(value, str):
-            raise integrators[0].error(f'{name} is not text; write <string name="{name}" value="..."/>')
-        values.append(" ".join(value.split()))
-    if not values[0]:
-        raise integrators[0].error('prompt is missing or blank; add <string name="prompt" value="a horse with wings"/>')
-    return values[0], values[1], values[2]
 
 
 def _to_world(element: SceneElement) -> np.ndarray:
@@ -196,7 +226,7 @@ def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
         raise UserError(
             f"{file.path}: base {names}: all its vertices are at one point; give a mesh with a size"
         ) from None
-    if not _encloses_volume(TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)):
+    if not encloses_volume(TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)):
         count = len(soup.faces)
         raise UserError(
             f"{file.path}: base {names}: its {count} faces enclose no volume; give a solid object, closed or nearly so"
@@ -204,33 +234,9 @@ def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
     return frame
 
 
-def _encloses_volume(mesh: TriangleMesh) -> bool:
-    """Whether behind at least 1 % of the area the winding number says inside: a sheet has no more than 1/2 there."""
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    if not length.sum() > 0:
-        return False
-    random = np.random.default_rng(0)
-    chosen = random.choice(len(length), size=2000, p=length / length.sum())
-    weights = random.dirichlet([1.0, 1.0, 1.0], size=2000)
-    points = np.einsum("ij,ijk->ik", weights, corners[chosen])
-    behind = 2e-3 * normal[chosen] / length[chosen, None]
-    distance = MeshDistance(mesh.vertices, mesh.faces)
-    number = np.maximum(
-        np.abs(distance.winding_number(points - behind)), np.abs(distance.winding_number(points + behind))
-    )
-    return bool(np.mean(number > 0.55) >= 0.01)
-
-
-def _region(file: SceneFile, element: SceneElement, index: int, frame: Normalisation) -> FocalRegion:
+def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame: Normalisation) -> FocalRegion:
     to_world = _to_world(element)
     name = element.id or f"region_{index + 1}"
-    part = element.properties.get("part", DEFAULT_PART_NAME)
-    if not isinstance(part, str) or not _PART_NAME.fullmatch(part) or part.endswith(".") or part == BASE_NAME:
-        raise element.error(
-            f"part {part!r} cannot name a file; use letters, digits, '_' and '-', and not {BASE_NAME!r}"
-        )
     mesh = None
     filename = element.properties.get("filename")
     if filename:
@@ -238,7 +244,7 @@ def _region(file: SceneFile, element: SceneElement, index: int, frame: Normalisa
         if not topology(vertices, faces).closed:
             raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
         mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, (file.resolve(filename),))
-    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh)
+    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element))
     if not region.volume > 0:
         raise element.error("the region has no volume; enlarge it")
     inside = share_in_grid(region)

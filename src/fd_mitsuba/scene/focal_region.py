@@ -13,6 +13,9 @@ from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
+ADD, SUBTRACT = "add", "subtract"
+"""The modes of a region: its part joins the base, or is cut out of it."""
+
 
 @dataclass(frozen=True)
 class FocalRegion:
@@ -25,12 +28,14 @@ class FocalRegion:
             Source: the paper, "Focal Region"; deviates: any affine map, not only R, T and S in a fixed order.
         part: name of the editable part that it belongs to.
         mesh: None for an ellipsoid, else the closed mesh, vertices in the canonical frame.
+        mode: `ADD` or `SUBTRACT`.
     """
 
     name: str
     to_canonical: np.ndarray
     part: str = DEFAULT_PART_NAME
     mesh: TriangleMesh | None = None
+    mode: str = ADD
 
     def __post_init__(self) -> None:
         matrix = np.array(self.to_canonical, dtype=np.float64)

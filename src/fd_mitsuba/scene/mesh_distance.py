@@ -41,6 +41,20 @@ class MeshDistance:
             squared[start : start + _CHUNK] = self._tree.squared_distance(self._vertices, self._faces, part)[0]
         return np.sqrt(squared)
 
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest face of each point (N,) int64, and where on it (N, 3) float64: weights of its corners.
+
+        Of several faces that are equally near, any; the weights are >= 0 and sum to 1, on a zero-area face too.
+        """
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        face, foot = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))
+        for start in range(0, len(points), _CHUNK):
+            part = points[start : start + _CHUNK]
+            _, face[start : start + _CHUNK], foot[start : start + _CHUNK] = self._tree.squared_distance(
+                self._vertices, self._faces, part
+            )
+        return face, _corner_weights(self._vertices[self._faces[face]], foot)
+
     def winding_number(self, points: np.ndarray) -> np.ndarray:
         """(N,) float64 generalised winding number: 1 inside a closed outward mesh, 0 outside, between for open ones."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
@@ -57,3 +71,19 @@ class MeshDistance:
         """(N,) float64 distance to the nearest face, positive inside (see `inside`), negative outside."""
         distance = self.unsigned(points)
         return np.where(self.inside(points), distance, -distance)
+
+
+def _corner_weights(corners: np.ndarray, foot: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (N, 3) of points `foot` (N, 3) on triangles `corners` (N, 3, 3)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weights = np.stack(
+        [
+            np.einsum("ij,ij->i", np.cross(corners[:, (i + 1) % 3] - foot, corners[:, (i + 2) % 3] - foot), normal)
+            for i in range(3)
+        ],
+        axis=1,
+    ).clip(min=0)
+    total = weights.sum(axis=1, keepdims=True)
+    flat = total[:, 0] <= 0
+    weights[flat], total[flat] = [1.0, 0.0, 0.0], 1.0
+    return weights / total

@@ -9,6 +9,7 @@ import numpy as np
 
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.mitsuba_api import FACES, VERTICES
+from fd_mitsuba.scene.focal_region import ADD
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, shape_triangles
 from fd_mitsuba.scene.tessellate import Arrays, unit_sphere
 
@@ -51,8 +52,9 @@ def region_triangles(mi: Any, filename: str | None, to_world: np.ndarray, subdiv
 
 
 def _focal_region(mi: Any, properties: Any) -> Any:
-    # Mitsuba's own names: `part` is ours, `filename` and `to_world` mean what they mean for a `ply`.
+    # Mitsuba's own names: `part` and `mode` are ours, `filename` and `to_world` mean what they mean for a `ply`.
     properties.get("part", DEFAULT_PART_NAME)
+    properties.get("mode", ADD)
     filename = properties.get("filename", None)
     to_world = np.array(properties.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
     vertices, faces = region_triangles(mi, filename, to_world)
@@ -77,6 +79,7 @@ def _dual_path_class(mi: Any) -> Any:
             self.prompt = properties.get("prompt", "")
             self.base_prompt = properties.get("base_prompt", "")
             self.negative_prompt = properties.get("negative_prompt", "")
+            self.simple_prompt = properties.get("simple_prompt", "")
             self._preview = mi.load_dict({"type": "path", "max_depth": 4})
 
         def sample(

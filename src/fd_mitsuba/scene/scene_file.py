@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ def file_threads() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SceneElement:
-    """One object of the scene file with its plain properties; child objects are left out.
+    """One object of the scene file with its plain properties.
 
     Attributes:
         kind: "shape", "bsdf", "integrator", "emitter", "texture", ... as the XML tag says.
@@ -53,6 +53,7 @@ class SceneElement:
         top_level: whether it is a direct child of `<scene>`.
         where: file and line, for messages.
         properties: name -> value as Mitsuba parsed it.
+        children: name -> position in `SceneFile.elements` of the objects that it holds or refers to.
     """
 
     kind: str
@@ -61,6 +62,7 @@ class SceneElement:
     top_level: bool
     where: str
     properties: dict[str, Any]
+    children: dict[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return _tag(self.kind, self.plugin, self.id)
@@ -128,6 +130,18 @@ class SceneFile:
             except RuntimeError as error:
                 raise self.translated(error) from None
         return scene[0] if isinstance(scene, list) else scene
+
+    def description(self, element: SceneElement) -> dict[str, Any]:
+        """The element and all below it as a dictionary for `mi.load_dict`, files with their full paths.
+
+        Children without a name, such as the BSDF in a `twosided`, are called "nested_0" and so on.
+        """
+        found: dict[str, Any] = {"type": element.plugin, **element.properties}
+        if isinstance(found.get("filename"), str):
+            found["filename"] = str(self.resolve(found["filename"]).resolve())
+        for name, position in element.children.items():
+            found[name.replace("_arg_", "nested_")] = self.description(self.elements[position])
+        return found
 
     def resolve(self, filename: str) -> Path:
         """The file that Mitsuba finds for a name in the scene: beside the scene first, then in its `<path>`s."""
@@ -198,6 +212,8 @@ class SceneFile:
                 top_level=number in children,
                 where=f"{file or self.path}:{line}",
                 properties=properties,
+                # Node 0 is the scene itself, which is no element.
+                children={key: self._index(node.props, key) - 1 for key in self._links(node.props)},
             )
             refuse_plugin_path(f"{element.where}: <{element.kind}>", element.plugin)
             yield element

@@ -32,8 +32,11 @@ class SceneText:
     used: set[str] = field(default_factory=set)
 
 
-def scan_scene(path: Path, parameters: dict[str, str]) -> SceneText:
+def scan_scene(path: Path, parameters: dict[str, str], all_used: bool = True) -> SceneText:
     """Scan a scene file and what it includes, before anything is parsed or loaded.
+
+    Args:
+        all_used: refuse a parameter that the scene does not use.
 
     Raises:
         UserError: no such file, a folder, unreadable, not XML, empty, another root than `<scene>`, nesting deeper than
@@ -42,14 +45,19 @@ def scan_scene(path: Path, parameters: dict[str, str]) -> SceneText:
     """
     found = SceneText()
     _scan(path, path.resolve().parent, parameters, found, depth=0)
-    for name in parameters:
-        # Mitsuba replaces the longest known name that follows a `$`, so that `$size2` uses `size` too.
-        if not any(used.startswith(name) for used in found.used):
+    for name in parameters if all_used else ():
+        if not uses(found, name):
             known = sorted(found.used | set(found.defaults))
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             hint = f"nearest: {near[0]}" if near else "it has no parameters; remove the option"
             raise UserError(f"{path}: -D {name}: the scene has no ${name}; {hint}")
     return found
+
+
+def uses(text: SceneText, name: str) -> bool:
+    """Whether a scene uses the parameter `name`."""
+    # Mitsuba replaces the longest known name that follows a `$`, so that `$size2` uses `size` too.
+    return any(used.startswith(name) for used in text.used)
 
 
 def _scan(path: Path, folder: Path, parameters: dict[str, str], found: SceneText, depth: int) -> None:

@@ -1,7 +1,8 @@
 """Checkpoints that a kill cannot spoil: one safetensors file a step, written aside and renamed.
 
 A file holds the field, the optimiser's moments, and in its header the stage, the step, the settings' hash, the format
-version and a hash of the tensors: safetensors has no checksum of its own, and a flipped bit must not train on.
+version, what the stage counts from step to step, and a hash of the tensors: safetensors has no checksum of its own,
+and a flipped bit must not train on.
 Random numbers depend on (seed, step) only, so no generator state is needed for a resumed run to go on exactly.
 """
 
@@ -12,6 +13,7 @@ import hashlib
 import json
 import os
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
 
 import torch
@@ -28,12 +30,18 @@ _LITTER = ".tmp"
 
 @dataclass(frozen=True)
 class CheckpointHeader:
-    """`step` counts the finished steps; `config_hash` is `RunConfig.content_hash`."""
+    """`step` counts the finished steps; `config_hash` is `RunConfig.content_hash`; `counters` are the stage's own."""
 
     stage: str
     step: int
     config_hash: str
     format: int = FORMAT
+    counters: dict[str, int] = dataclass_field(default_factory=dict)
+
+
+def checkpoint_folder(run: Path, stage: str) -> Path:
+    """Where a run folder keeps the checkpoints of a stage."""
+    return run / ("checkpoints" if stage == "geometry" else f"checkpoints_{stage}")
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
@@ -94,9 +102,14 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_newest(
-    folder: Path, stage: str, config_hash: str, field: nn.Module, optimiser: torch.optim.Optimizer
+    folder: Path,
+    stage: str,
+    config_hash: str,
+    field: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    counters: dict[str, int] | None = None,
 ) -> tuple[int, list[str]]:
-    """Load the newest whole checkpoint into the field and the optimiser.
+    """Load the newest whole checkpoint into the field and the optimiser, and its counters into `counters` if given.
 
     Returns:
         The number of finished steps (0 without a checkpoint), and a line for each damaged file that was passed over.
@@ -118,6 +131,8 @@ def load_newest(
             remarks.append(f"{path}: damaged checkpoint passed over (its tensors do not fit their hash)")
             continue
         _apply(path, tensors, field, optimiser)
+        if counters is not None:
+            counters.update(header.get("counters", {}))
         return int(header["step"]), remarks
     return 0, remarks
 
@@ -143,6 +158,9 @@ def _check_header(path: Path, header: object, stage: str, config_hash: str) -> N
         )
     if not isinstance(header.get("step"), int) or header["step"] < 0:
         raise UserError(f"{path}: its header has no step; remove this file to resume from an earlier one")
+    counters = header.get("counters", {})
+    if not isinstance(counters, dict) or not all(isinstance(value, int) for value in counters.values()):
+        raise UserError(f"{path}: its header's counters cannot be read; remove this file to resume from an earlier one")
 
 
 def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: torch.optim.Optimizer) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.extraction.subtraction import SubtractionExtractor
 from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface, active_vertices
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
@@ -24,8 +25,10 @@ from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
+from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch, sample_views
 from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.sheets import geometry_sheet
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
@@ -47,6 +50,10 @@ class StepRecord:
     pictures: Tensor
     preview: Tensor | None
 
+    def sheet(self) -> np.ndarray | None:
+        """Normals, part masks, and the guidance's estimate."""
+        return geometry_sheet(self.pictures, self.preview)
+
 
 class GeometryStage:
     """Everything that the geometry stage holds between steps; its random numbers depend on (seed, step) only.
@@ -56,6 +63,8 @@ class GeometryStage:
         config: how.
         guidance: the source of the image loss; its prompt must be set. None leaves the image loss out.
     """
+
+    name = "geometry"
 
     def __init__(self, scene: EditScene, config: RunConfig, guidance: Guidance | None) -> None:
         geometry = config.geometry
@@ -89,11 +98,22 @@ class GeometryStage:
             weight_decay=geometry.weight_decay,
             fused=True,
         )
-        self.focus = _bounding_ball(points[(self.region_sdf > 0).numpy()])
-        self.aim = _centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
+        self.focus = bounding_ball(points[(self.region_sdf > 0).numpy()])
+        self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
         self._base_passes: dict[Phase, GeometryPass] = {}
-        self._invisible = 0
+        self.counters = {"invisible_steps": 0}
+        """Whole numbers that steps hand on to later ones; a checkpoint keeps them."""
+
+    @property
+    def steps(self) -> int:
+        """Steps of both phases together."""
+        return self.config.geometry.steps
+
+    @property
+    def lambda_collision(self) -> float:
+        """The weight of L_CA; 0 where the part is cut out of the base, which it must enter."""
+        return 0.0 if self.scene.subtracts else self.config.geometry.lambda_collision
 
     @property
     def coarse_steps(self) -> int:
@@ -106,6 +126,10 @@ class GeometryStage:
         if step < coarse:
             return "coarse", step, coarse
         return "refined", step - coarse, self.config.geometry.steps - coarse
+
+    def phase_name(self, step: int) -> str:
+        """`coarse` or `refined`."""
+        return self.phase_of(step)[0]
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
         """The step's views, and whether they are close-ups of the focal regions."""
@@ -123,27 +147,13 @@ class GeometryStage:
         return views, closeup
 
     def surface(self) -> UnionSurface:
-        """The union's surface for the present parameters, with gradients."""
+        """The surface of the base with the part, or without it, for the present parameters; with gradients."""
         return self.extractor(self.field)
 
     def start_surface(self) -> UnionSurface:
-        """The union's surface with the focal regions themselves as the part, without gradients."""
+        """`surface` with the focal regions themselves as the part, without gradients."""
         with torch.no_grad():
             return self.extractor(PartField(self.config.field.model_copy(update={"offsets": False})))
-
-    def part_solid(self, name: str | None) -> tuple[Tensor, Tensor]:
-        """The part's closed solid, vertices (V, 3) and faces (F, 3), canonical, without gradients.
-
-        Args:
-            name: a named part: what of the solid is nearer to its regions than to those of the others; None: all.
-        """
-        label = None
-        if name is not None and len(self.scene.parts) > 1:
-            points = self.grid.vertices.numpy()
-            others = [region for other, regions in self.scene.parts.items() if other != name for region in regions]
-            own = union_sdf(self.scene.parts[name], points)
-            label = torch.from_numpy(((own - union_sdf(others, points)) / 2).astype(np.float32))
-        return self.extractor.extract_part(self.field, label)
 
     def step(self, step: int) -> StepRecord:
         """Run step `step` (counted from 0 over both phases) and change the field once.
@@ -215,7 +225,7 @@ class GeometryStage:
                 geometry.focal_sigma_sdf,
                 geometry.focal_margin,
             )
-        if geometry.lambda_collision > 0:
+        if self.lambda_collision > 0:
             losses["collision"] = loss_collision(self.sdf_base[samples], sdf_part)
         if geometry.lambda_volume > 0:
             losses["volume"] = (0.5 + sdf_part / (2 * self.grid.spacing)).clamp(0, 1).mean()
@@ -223,7 +233,7 @@ class GeometryStage:
 
     def _samples(self, step: int) -> Tensor | None:
         geometry = self.config.geometry
-        if geometry.lambda_focal == geometry.lambda_collision == geometry.lambda_volume == 0:
+        if geometry.lambda_focal == self.lambda_collision == geometry.lambda_volume == 0:
             return None
         index = self.extractor.active_index
         if len(index) <= geometry.focal_samples:
@@ -239,6 +249,7 @@ class GeometryStage:
             cameras,
             seed_for(self.config.seed, Purpose.PIXELS, step),
             static_faces=self.extractor.static_faces,
+            static_vertices=self.extractor.static_vertices,
         )
 
     def _render_base(self, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
@@ -264,9 +275,8 @@ class GeometryStage:
 
     def _extractor(self, active: Tensor) -> SurfaceExtractor:
         geometry = self.config.geometry
-        return SurfaceExtractor(
-            self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside
-        )
+        kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
+        return kind(self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside)
 
     def _base_surface(self) -> UnionSurface:
         with torch.no_grad():
@@ -274,8 +284,9 @@ class GeometryStage:
             return alone(PartField(self.config.field))
 
     def _watch_visibility(self, pictures: Tensor) -> None:
-        self._invisible = self._invisible + 1 if float(pictures[:, 4].detach().sum()) < 0.5 else 0
-        if self._invisible >= VANISHED_AFTER:
+        visible = float(pictures[:, 4].detach().sum()) >= 0.5
+        self.counters["invisible_steps"] = 0 if visible else self.counters["invisible_steps"] + 1
+        if self.counters["invisible_steps"] >= VANISHED_AFTER:
             raise RunStopped(
                 f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
                 "or lower geometry.lambda_volume"
@@ -285,12 +296,3 @@ class GeometryStage:
         for parameter in self.field.parameters():
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
                 raise RunStopped(f"step {step}: a gradient is not finite; lower geometry.learning_rate")
-
-
-def _bounding_ball(points: np.ndarray) -> tuple[np.ndarray, float]:
-    centre = _centre_of_box(points)
-    return centre, float(np.linalg.norm(points - centre, axis=1).max())
-
-
-def _centre_of_box(points: np.ndarray) -> np.ndarray:
-    return (points.min(axis=0) + points.max(axis=0)) / 2

@@ -10,11 +10,10 @@ from pathlib import Path
 from types import FrameType
 
 from fd_mitsuba.errors import Interrupted
-from fd_mitsuba.training.checkpoint import CheckpointHeader, load_newest, save_checkpoint
-from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, load_newest, save_checkpoint
 from fd_mitsuba.training.record import Recorder
+from fd_mitsuba.training.stage import Stage
 
-STAGE = "geometry"
 _FIELD_CHECKED_EVERY = 10
 
 
@@ -44,14 +43,14 @@ def stop_on_signals() -> Iterator[_StopRequest]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-def run_geometry(
-    stage: GeometryStage,
+def run_stage(
+    stage: Stage,
     folder: Path,
     resume: bool = False,
     quiet: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Train until the last step; the newest checkpoint in `folder/checkpoints` then holds the result.
+    """Train until the last step; the newest checkpoint in the stage's `checkpoint_folder` then holds the result.
 
     Args:
         stage: fresh; a checkpoint is loaded into it if `resume`.
@@ -63,20 +62,20 @@ def run_geometry(
         RunStopped: the run cannot go on; the checkpoints stay as they were.
         UserError: a checkpoint that does not fit, a folder that cannot be written.
     """
-    config, checkpoints = stage.config, folder / "checkpoints"
-    config_hash, total = config.content_hash(), config.geometry.steps
+    config, checkpoints = stage.config, checkpoint_folder(folder, stage.name)
+    config_hash, total = config.content_hash(stage.name), stage.steps
     done = 0
     if resume:
-        done, remarks = load_newest(checkpoints, STAGE, config_hash, stage.field, stage.optimiser)
+        done, remarks = load_newest(checkpoints, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
         for remark in remarks:
             say(remark)
         say(f"resuming after step {done} of {total}" if done else "no checkpoint yet: starting at step 0")
 
     def save(step: int) -> None:
-        header = CheckpointHeader(STAGE, step, config_hash)
+        header = CheckpointHeader(stage.name, step, config_hash, counters=dict(stage.counters))
         save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept)
 
-    with stop_on_signals() as request, Recorder(folder, STAGE, total, done, quiet) as recorder:
+    with stop_on_signals() as request, Recorder(folder, stage.name, total, done, quiet) as recorder:
         for step in range(done, total):
             record = stage.step(step)
             finished = step + 1
@@ -86,10 +85,10 @@ def run_geometry(
             values = dict(record.values)
             if saving or finished % _FIELD_CHECKED_EVERY == 0:
                 values.update(stage.check_field(finished))
-            recorder.row(finished, stage.phase_of(step)[0], values)
+            recorder.row(finished, stage.phase_name(step), values)
             every = config.output.sheet_every
-            if len(record.pictures) and every and (finished % every == 0 or last):
-                recorder.sheet(finished, record)
+            if every and (finished % every == 0 or last) and (sheet := record.sheet()) is not None:
+                recorder.sheet(finished, sheet)
             if saving:
                 save(finished)
             if stopped_by is not None:

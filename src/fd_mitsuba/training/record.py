@@ -10,13 +10,11 @@ from types import TracebackType
 from typing import IO
 
 import numpy as np
-import torch
 from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from fd_mitsuba.training.checkpoint import write_atomically
-from fd_mitsuba.training.geometry_stage import StepRecord
 
 _SHOWN = ("loss_sds", "loss_focal", "loss_collision", "volume_ratio")
 _PLAIN_EVERY_SECONDS = 15.0
@@ -107,27 +105,14 @@ class Recorder:
             self._console.print(
                 f"{phase} {step}/{self._total}  {rate:.2f} s/step  ETA {rate * (self._total - step):.0f} s  {shown}",
                 highlight=False,
+                soft_wrap=True,  # into a file, a line stays a line
             )
 
-    def sheet(self, step: int, record: StepRecord) -> Path:
-        """Write the step's views as `images/step_NNNNNN.png`: normals, part mask, and the guidance's estimate below."""
-        rows = [np.concatenate(list(normal_pictures(record.pictures)), axis=1)]
-        mask = record.pictures[:, 4].clamp(0, 1).numpy()
-        rows.append(np.repeat(np.concatenate(list((mask * 255).astype(np.uint8)), axis=1)[..., None], 3, axis=2))
-        sheet = np.concatenate(rows, axis=0)
-        if record.preview is not None:
-            # Latents are read as (normal, 2 mask - 1), which is what they are for the built-in prior.
-            latents = record.preview.float().cpu()
-            guess = torch.cat([latents[:, :3], (latents[:, 3:4] + 1) / 2], dim=1)
-            strip = np.concatenate(list(normal_pictures(guess)), axis=1)
-            image = Image.fromarray(strip)
-            height = max(1, round(strip.shape[0] * sheet.shape[1] / strip.shape[1]))
-            below = np.asarray(image.resize((sheet.shape[1], height), Image.Resampling.NEAREST))
-            sheet = np.concatenate([sheet, below], axis=0)
-        factor = max(1, round(512 / sheet.shape[1]))
-        path = self._images / f"step_{step:06d}.png"
-        size = (sheet.shape[1] * factor, sheet.shape[0] * factor)
-        write_picture(path, Image.fromarray(sheet).resize(size, Image.Resampling.NEAREST))
+    def sheet(self, step: int, picture: np.ndarray) -> Path:
+        """Write the step's contact sheet (H, W, 3) uint8 as `images/step_NNNNNN.png`, or under the stage's name."""
+        prefix = "step" if self._stage == "geometry" else self._stage
+        path = self._images / f"{prefix}_{step:06d}.png"
+        write_picture(path, Image.fromarray(picture))
         return path
 
 
@@ -136,13 +121,6 @@ def write_picture(path: Path, image: Image.Image) -> None:
     data = io.BytesIO()
     image.save(data, format="PNG")
     write_atomically(path, data.getvalue())
-
-
-def normal_pictures(pictures: torch.Tensor) -> np.ndarray:
-    """Colours (B, H, W, 3) uint8 of geometry pictures (B, >=4, H, W): (n + 1) / 2 on covered pixels over black."""
-    normal, mask = pictures[:, :3], pictures[:, 3:4]
-    colour = ((normal + mask) / 2).clamp(0, 1).permute(0, 2, 3, 1)
-    return (colour.numpy() * 255 + 0.5).astype(np.uint8)
 
 
 def _short(value: float) -> float:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -12,11 +15,13 @@ import torch
 
 from fd_mitsuba import __version__
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.training.checkpoint import is_litter, write_atomically
+from fd_mitsuba.training.checkpoint import is_litter, list_checkpoints, write_atomically
 
 _IDENTITY_NAME, _SETTINGS_NAME = "run.json", "config.json"
+_FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", _IDENTITY_NAME)
+_FOLDERS = ("scene", "images", "checkpoints")
 
 
 def check_folder(scene: EditScene, config: RunConfig, folder: Path, resume: bool) -> None:
@@ -45,7 +50,7 @@ def describe_run(scene: EditScene, config: RunConfig, folder: Path, command: str
         UserError: the folder cannot be written.
     """
     # The identity comes first: from then on the folder is a run's, whenever it is killed.
-    write_json(folder / _IDENTITY_NAME, _identity(scene, config))
+    write_json(folder / _IDENTITY_NAME, identity(scene, config))
     for path in folder.rglob(".*"):
         if is_litter(path):
             path.unlink(missing_ok=True)
@@ -57,12 +62,40 @@ def describe_run(scene: EditScene, config: RunConfig, folder: Path, command: str
     _copy_scene(scene, folder / "scene")
 
 
+@contextmanager
+def discarded_without_checkpoint(folder: Path) -> Iterator[None]:
+    """Around the steps of a run: when they end with an error before the first checkpoint, what was written goes again.
+
+    So the same command can be repeated once the cause is mended. An interrupted run stays as it is. Opened only for a
+    folder that `check_folder` has let pass: no file in it is anybody else's.
+
+    Raises:
+        RunStopped: with what is left and how to go on added to its message.
+    """
+    try:
+        yield
+    except (UserError, OSError) as error:
+        kept = [path for stage in sorted(folder.glob("checkpoints*")) for path in list_checkpoints(stage)]
+        if not kept:
+            _discard(folder)
+        if not isinstance(error, RunStopped):
+            raise
+        if not kept:
+            raise RunStopped(f"{error}; no step was kept, so the same -o can be used again") from None
+        step = int(kept[-1].stem[5:])
+        raise RunStopped(
+            f"{error}; {folder} keeps the state after step {step}: try other settings with another -o, or go on with "
+            "the same by --resume"
+        ) from None
+
+
 def write_json(path: Path, data: dict) -> None:
     """Write indented JSON, whole or not at all; UserError if the folder cannot be written."""
     write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
 
 
-def _identity(scene: EditScene, config: RunConfig) -> dict:
+def identity(scene: EditScene, config: RunConfig) -> dict:
+    """What `run.json` holds: the scene by path and content, prompt, `-D` parameters, the settings' hash."""
     digest = hashlib.sha256()
     for file in scene.files:
         data = Path(file).read_bytes()
@@ -71,13 +104,14 @@ def _identity(scene: EditScene, config: RunConfig) -> dict:
         "scene": str(scene.path.resolve()),
         "scene_hash": digest.hexdigest()[:16],
         "prompt": scene.prompt,
-        "parameters": scene.parameters,
+        "regions": None if scene.regions_path is None else str(scene.regions_path.resolve()),
+        "parameters": scene.regions_parameters | scene.parameters,
         "config_hash": config.content_hash(),
     }
 
 
 def _refuse_other_run(scene: EditScene, config: RunConfig, folder: Path) -> None:
-    known, now = _read_json(folder / _IDENTITY_NAME), _identity(scene, config)
+    known, now = _read_json(folder / _IDENTITY_NAME), identity(scene, config)
     remedy = "resume with the run's own scene, --prompt, -c, --set and -D, or choose another -o folder"
     for key in ("prompt", "parameters"):
         if known.get(key) != now[key]:
@@ -90,6 +124,16 @@ def _refuse_other_run(scene: EditScene, config: RunConfig, folder: Path) -> None
             f"{key} = {before.get(key)}, now {value}" for key, value in after.items() if before.get(key) != value
         ]
         raise UserError(f"{folder}: holds a run with other settings ({'; '.join(changed[:3]) or 'unknown'}); {remedy}")
+
+
+def _discard(folder: Path) -> None:
+    for name in _FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    # The identity goes last: until then, whatever is left is a run's and no stranger's.
+    with suppress(OSError):
+        for path in [*filter(is_litter, folder.glob(".*")), *(folder / name for name in _FILES)]:
+            path.unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def _flat(settings: dict) -> dict:

@@ -16,6 +16,14 @@ class Purpose(IntEnum):
     SAMPLES = 3
     GUIDANCE = 4
     BASE_PIXELS = 5
+    TEXTURE = 6
+    APPEARANCE_VIEWS = 7
+    APPEARANCE_PIXELS = 8
+    APPEARANCE_GUIDANCE = 9
+    BACKGROUND = 10
+    STYLE = 11
+    EXPOSURE = 12
+    BASE_MATERIAL = 13
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:

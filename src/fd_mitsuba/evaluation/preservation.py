@@ -1,0 +1,77 @@
+"""How much the base's pixels change when the part is there: not at all, where no light is taken or added by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull
+
+from fd_mitsuba.mitsuba_api import VERTICES
+from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.scene.views import CameraBatch
+
+MOST_DECIBELS = 200.0
+"""What equal pictures are given, so that the figure stays a number in JSON."""
+
+
+@dataclass(frozen=True)
+class BasePreservation:
+    """Attributes:
+    base_psnr_db: over pixels that show nothing but the base and whose light the part does not touch, of linear
+        radiance after exposure; `MOST_DECIBELS` where they are equal.
+    untouched_share: how much of the base's pixels that are.
+    mask_error: the largest difference between alpha and the sum of the two sides of the mask.
+    """
+
+    base_psnr_db: float
+    untouched_share: float
+    mask_error: float
+
+
+@torch.no_grad()
+def measure_preservation(
+    with_part: AppearancePass, alone: AppearancePass, cameras: CameraBatch, exposure: float, size: int, spp: int
+) -> BasePreservation:
+    """Compare the base path with the render of the base alone, at equal seeds.
+
+    Args:
+        with_part, alone: passes of the same scene, the second without any part.
+    """
+    edited, base = (rendering.trace(cameras, 0, size=size, spp=spp) for rendering in (with_part, alone))
+    pair = with_part.render_base(edited, 0) * exposure, alone.render_base(base, 0) * exposure
+    whole = (edited.base_mask > 0.999) & (base.base_mask > 0.999)
+    touched = light_may_be_touched(with_part, edited)
+    counted = (whole & ~touched).expand(-1, 3, -1, -1)
+    error = float((pair[0] - pair[1])[counted].square().mean()) if counted.any() else 0.0
+    decibels = MOST_DECIBELS if error == 0 else min(-10 * float(np.log10(error)), MOST_DECIBELS)
+    sides = (edited.alpha - edited.part_mask - edited.base_mask).abs().max()
+    share = float((whole & ~touched).sum() / max(int(whole.sum()), 1))
+    return BasePreservation(decibels, share, float(sides))
+
+
+def light_may_be_touched(rendering: AppearancePass, gbuffer: GBuffer) -> torch.Tensor:
+    """(B, 1, S, S) bool: pixels with a base sample over whose horizon some of a part rises, so that it may take or
+    send light there. Of an opaque base all others are lit as without the part, if light does not bounce."""
+    views, size, samples = gbuffer.views.count, gbuffer.views.size, gbuffer.base_samples
+    touched = np.zeros(views * size * size, dtype=bool)
+    if len(samples):
+        ray = gbuffer.rays(samples)
+        surface = samples.hit.compute_surface_interaction(ray, mi.RayFlags.All)
+        facing = dr.mulsign(mi.Vector3f(surface.n), dr.dot(surface.n, -ray.d))
+        points, normals = np.array(surface.p).T.astype(np.float64), np.array(facing).T.astype(np.float64)
+        corners = np.concatenate([_hull(part) for part in rendering.scene.parts])
+        height = np.full(len(points), -np.inf)
+        for corner in corners:
+            np.maximum(height, np.einsum("ij,ij->i", normals, corner - points), out=height)
+        touched[np.array(samples.lane)[height > 0] // gbuffer.spp] = True
+    return torch.from_numpy(touched).reshape(views, 1, size, size)
+
+
+def _hull(part: mi.Mesh) -> np.ndarray:
+    vertices = np.array(mi.traverse(part)[VERTICES], dtype=np.float64).reshape(-1, 3)
+    return vertices[ConvexHull(vertices).vertices]

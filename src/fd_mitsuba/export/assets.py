@@ -1,0 +1,210 @@
+"""Everything that a run hands over to other programs: GLB, OBJ, PLY and a plain Mitsuba scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fd_mitsuba import __version__
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.conventions import BASE_NAME
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
+from fd_mitsuba.export.cut_shapes import CutBase
+from fd_mitsuba.export.gltf import GltfMesh, glb_bytes, is_placement
+from fd_mitsuba.export.meshes import copy_base
+from fd_mitsuba.export.mitsuba_files import write_mitsuba
+from fd_mitsuba.export.obj import ObjMesh, obj_files
+from fd_mitsuba.export.ready_part import PartAsset, ReadyPart, ready_part
+from fd_mitsuba.export.tangents import vertex_tangents
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.part_stack import SHOWN, read_stack
+from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.training.checkpoint import write_atomically
+
+FORMATS = ("glb", "obj", "ply", "mitsuba")
+
+
+def export_assets(
+    scene: EditScene,
+    config: RunConfig,
+    parts: Mapping[str, PartAsset],
+    folder: Path,
+    formats: Collection[str] = FORMATS,
+    texture_size: int = 1024,
+    say: Callable[[str], None] = lambda line: None,
+    cut: CutBase | None = None,
+    face_budget: int | None = None,
+) -> dict[str, Any]:
+    """Write the base's files unchanged into `base/`, and the formats asked for; returns what was written.
+
+    `asset.glb`, `obj/asset.obj`, `ply/part_<name>.ply`, `mitsuba/scene.xml`, and with learned materials their
+    pictures in `textures/`, as PNG and EXR. Everything is in the user's frame and unit.
+
+    Args:
+        parts: name -> part.
+        folder: is made if it is missing; files of the same name are replaced.
+        formats: of `FORMATS`.
+        texture_size: texels a side of each part's textures.
+        say: takes remarks, a line each.
+        cut: the base without the parts, where these were removed from it: it is written, in place of base and parts.
+        face_budget: that the parts were decimated to, for the record.
+
+    Parts that `mitsuba/stack.json` in the folder calls hidden or removed are left out of everything.
+
+    Raises:
+        UserError: an unknown format or texture size, names that clash, a part without volume, a file of the scene that
+            is gone, a folder that cannot be written.
+    """
+    _check(scene, parts, folder, formats, texture_size)
+    inputs = scene.inputs()
+    file = inputs.scene
+    states = {part.name: part for part in read_stack(folder / "mitsuba")[0] if part.state != SHOWN}
+    absent = {part.shape for part in scene.earlier if part.name in states}
+    whole = base_shapes(scene, file) if cut is None else cut.shapes
+    shapes = [shape for shape in whole if shape is not None and shape.name not in absent]
+    kept = replace(scene, base=tuple(mesh for mesh in scene.base if mesh.name not in absent))
+    identical = copy_base(kept, folder / BASE_NAME, _base_textures(file, absent))
+    added = {name: part for name, part in parts.items() if name not in states} if cut is None else {}
+    ready = [ready_part(scene, config, inputs, name, part, folder, texture_size, say) for name, part in added.items()]
+    notes = {item.material.name: list(item.material.notes) for item in [*shapes, *ready] if item.material.notes}
+    extras = {"prompt": scene.prompt, "seed": config.seed, "version": __version__, "unit": "as in the scene file"}
+    written: list[str] = []
+
+    def write(name: str, data: bytes) -> None:
+        write_atomically(folder / name, data)
+        written.append(name)
+
+    if "glb" in formats:
+        write("asset.glb", glb_bytes(_gltf_meshes(scene, shapes, ready, extras), extras))
+    if "obj" in formats:
+        for name, data in obj_files(_obj_meshes(scene, shapes, ready)).items():
+            write(f"obj/{name}", data)
+    if "ply" in formats:
+        for name, source in _earlier_files(kept, cut).items():
+            write(f"ply/{name}.ply", source.read_bytes())
+        for part in ready:
+            write(f"ply/part_{part.name}.ply", part.ply())
+        for name, data in cut.files().items() if cut is not None else ():
+            write(f"ply/{name}", data)
+    if "mitsuba" in formats:
+        write_mitsuba(scene, inputs, ready, write, cut, states, {"texture_size": texture_size, "faces": face_budget})
+    return {
+        "files": written,
+        "base_identical": identical,
+        "part_faces": {part.name: len(part.mesh.faces) for part in ready},
+        "notes": notes,
+    }
+
+
+def _check(
+    scene: EditScene, parts: Mapping[str, PartAsset], folder: Path, formats: Collection[str], texture_size: int
+) -> None:
+    unknown = sorted(set(formats) - set(FORMATS))
+    if unknown:
+        raise UserError(f"--format {unknown[0]}: unknown; choose from {', '.join(FORMATS)}")
+    if not 16 <= texture_size <= 8192:
+        raise UserError(f"--texture-size {texture_size}: give a number from 16 to 8192")
+    if not parts:
+        raise UserError(f"{scene.path}: no part to export; add a focal region")
+    taken = {shape_name(scene, mesh.name).lower(): mesh.name for mesh in scene.base}
+    taken[BASE_NAME] = "the base"
+    for name, part in parts.items():
+        # File systems and programs that take A for a are common.
+        for wanted in {name.lower(), f"part_{name}".lower()}:
+            if wanted in taken:
+                raise UserError(f"{scene.path}: part {name!r} has the name of {taken[wanted]}; rename one of them")
+        taken |= {name.lower(): name, f"part_{name}".lower(): name}
+        volume = TriangleMesh(name, part.vertices, part.faces).volume() if len(part.faces) else 0.0
+        if not volume > 0:
+            raise UserError(f"{folder}: part {name!r} has no volume to export; run more steps, or enlarge its region")
+    probe = folder / ".writable.tmp"
+    write_atomically(probe, b"")
+    probe.unlink(missing_ok=True)
+
+
+def shape_name(scene: EditScene, name: str) -> str:
+    """A base mesh's name in the exports: `base`, `base_<name>` where there are several, `part_<name>` of old parts."""
+    earlier = {part.shape for part in scene.earlier}
+    if name in earlier:
+        return name
+    return BASE_NAME if len(scene.base) - len(earlier) == 1 else f"{BASE_NAME}_{name}"
+
+
+def _base_textures(file: SceneFile, absent: Collection[str]) -> list[Path]:
+    """Picture files that the materials of the scene's shapes read, without those of shapes with the ids `absent`."""
+    found: dict[Path, None] = {}
+
+    def visit(element: SceneElement) -> None:
+        for index in element.children.values():
+            child = file.elements[index]
+            name = child.properties.get("filename")
+            if child.kind == "texture" and isinstance(name, str):
+                found[file.resolve(name)] = None
+            visit(child)
+
+    for element in file.top_level("shape"):
+        if element.id not in absent:
+            visit(element)
+    return list(found)
+
+
+def _earlier_files(scene: EditScene, cut: CutBase | None) -> dict[str, Path]:
+    """Shape -> the PLY of every part of an earlier round that is still what it was."""
+    earlier = {part.shape for part in scene.earlier}
+    changed = (
+        {shape.name for shape, is_cut in zip(cut.shapes, cut.is_cut, strict=True) if is_cut and shape} if cut else ()
+    )
+    files = {mesh.name: mesh.source_files[0] for mesh in scene.base if mesh.name in earlier and mesh.source_files}
+    return {name: file for name, file in files.items() if name not in changed and file.suffix == ".ply"}
+
+
+def _gltf_meshes(
+    scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart], extras: dict[str, Any]
+) -> list[GltfMesh]:
+    meshes = []
+    earlier = {part.shape: part for part in scene.earlier}
+    for shape in shapes:
+        vertices, faces, normals, place = shape.vertices, shape.faces, shape.normals, shape.to_world
+        if not is_placement(place) or np.linalg.det(place[:3, :3]) < 0:
+            vertices, faces, normals = shape.in_user_frame()
+            place = np.eye(4)
+        tangents = None
+        if shape.material.normal_picture is not None and normals is not None and shape.uv is not None:
+            tangents = vertex_tangents(vertices, faces, normals, shape.uv)
+        name = shape_name(scene, shape.name)
+        parent = "" if name == BASE_NAME or shape.name in earlier else BASE_NAME
+        about: dict[str, Any] = {"shape": shape.name}
+        if old := earlier.get(shape.name):
+            about = {"part": old.name, "prompt": old.prompt, "round": old.round}
+        meshes.append(
+            GltfMesh(
+                name, vertices, faces, shape.material, normals, shape.uv, tangents, shape.colours, place, parent, about
+            )
+        )
+    for part in parts:
+        mesh = part.mesh
+        tangents = vertex_tangents(mesh.vertices, mesh.faces, mesh.normals, mesh.uv)
+        about = {**extras, "part": part.name}
+        name = f"part_{part.name}"
+        meshes.append(
+            GltfMesh(name, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv, tangents, extras=about)
+        )
+    return meshes
+
+
+def _obj_meshes(scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart]) -> list[ObjMesh]:
+    meshes = []
+    for shape in shapes:
+        vertices, faces, normals = shape.in_user_frame()
+        name = shape_name(scene, shape.name)
+        meshes.append(ObjMesh(name, vertices, faces, shape.material, normals, shape.uv, shape.colours))
+    for part in parts:
+        mesh = part.mesh
+        meshes.append(ObjMesh(f"part_{part.name}", mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv))
+    return meshes

@@ -1,0 +1,198 @@
+"""The base's shapes after the parts were cut out of them, with normals, UVs and colours, and what was removed.
+
+Each shape is cut in its own frame, so that a triangle away from the cut keeps every number of its file. A face of the
+cut takes the UV, or the colour, that the base has at the nearest point of its surface: one for the whole face, because
+three of their own may lie on different charts of an atlas.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import manifold3d
+import numpy as np
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
+from fd_mitsuba.export.cut_base import CutMesh, cut_mesh
+from fd_mitsuba.export.solid import Solid
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.scene_file import SceneFile
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class CutBase:
+    """The base after the cut.
+
+    Attributes:
+        shapes: what is left of each shape, in the order of the scene; None where nothing is.
+        is_cut: whether each of them changed.
+        removed: name of a part -> what it took away of all shapes, user frame.
+        figures: `removed_volume`, cubic user units, shapes that overlap counted one by one; `volume_change_error`,
+            |base - cut - removed| / removed, three volumes that are measured one by one.
+    """
+
+    shapes: tuple[BaseShape | None, ...]
+    is_cut: tuple[bool, ...]
+    removed: dict[str, Solid]
+    figures: dict[str, float]
+
+    def names(self) -> dict[int, str | None]:
+        """Number of a shape that was cut -> the name of its file, None where nothing is left."""
+        names: dict[int, str | None] = {}
+        for i, (shape, is_cut) in enumerate(zip(self.shapes, self.is_cut, strict=True)):
+            if is_cut:
+                name = None if shape is None else cut_file(shape.name)
+                names[i] = f"{i}_{name}" if name is not None and name in names.values() else name
+        return names
+
+    def files(self) -> dict[str, bytes]:
+        """File name -> PLY of every shape that was cut and has something left, in the shape's own frame."""
+        names = self.names()
+        return {
+            name: shape_ply(shape)
+            for i, shape in enumerate(self.shapes)
+            if shape is not None and (name := names.get(i)) is not None
+        }
+
+
+def cut_file(name: str) -> str:
+    """The file name of a cut shape's mesh."""
+    return "cut_" + re.sub(r"[^\w.-]", "_", name) + ".ply"
+
+
+def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> CutBase:
+    """The base without the parts' solids, given in the canonical frame.
+
+    Raises:
+        UserError: nothing was removed, nothing is left, or a solid or a shape within its reach is not closed.
+    """
+    tools = {name: solid.moved(np.linalg.inv(scene.frame.matrix())) for name, solid in solids.items()}
+    tools = {name: tool for name, tool in tools.items() if len(tool.faces)}
+    shapes, is_cut, pieces = [], [], {name: [] for name in tools}
+    before = after = removed = 0.0
+    for shape, mesh in zip(base_shapes(scene, file), scene.base, strict=True):
+        left: BaseShape | None = shape
+        near = {name: tool for name, tool in tools.items() if _boxes_meet(tool.vertices, mesh.vertices)}
+        if near:
+            whole = manifold3d.Manifold(_plain(mesh.vertices, mesh.faces))
+            for name, tool in near.items():
+                pieces[name].append(whole ^ _manifold(tool))
+            volume = reduce(lambda a, b: a + b, (_manifold(tool) for tool in near.values()))
+            removed += (whole ^ volume).volume()
+            for tool in near.values():
+                left = left if left is None else _cut(left, tool.moved(np.linalg.inv(shape.to_world)))
+            before += _volume(shape)
+            after += 0.0 if left is None else _volume(left)
+        shapes.append(left)
+        is_cut.append(left is not shape)
+    if not removed > 0:
+        raise UserError(f"{scene.path}: nothing was removed from the base; run more steps, or move the region into it")
+    if all(shape is None for shape in shapes):
+        raise UserError(f"{scene.path}: nothing is left of the base; shrink the region")
+    solids_removed = {name: _solid(found) for name, found in pieces.items()}
+    figures = {"removed_volume": before - after, "volume_change_error": abs(before - after - removed) / removed}
+    return CutBase(tuple(shapes), tuple(is_cut), solids_removed, figures)
+
+
+def shape_ply(shape: BaseShape) -> bytes:
+    """A binary PLY of a shape in its own frame, every float as it is: v runs as Mitsuba has it, no flip is needed.
+
+    Colours are the `vertex_color` of Mitsuba, linear.
+    """
+    columns, names = [shape.vertices], ["x", "y", "z"]
+    for values, own in ((shape.normals, "nx ny nz"), (shape.uv, "s t"), (shape.colours, "r g b")):
+        if values is not None:
+            columns.append(values)
+            names += own.split()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(shape.vertices)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(shape.faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    rows = np.empty(len(shape.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    rows["count"], rows["index"] = 3, shape.faces
+    data = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+    return "\n".join(header).encode("ascii") + data.tobytes() + rows.tobytes()
+
+
+def _cut(shape: BaseShape, tool: Solid) -> BaseShape | None:
+    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left."""
+    carried = [values for values in (shape.normals, shape.uv, shape.colours) if values is not None]
+    empty = np.zeros((len(shape.vertices), 0))
+    cut = cut_mesh(shape.name, shape.vertices, shape.faces, np.concatenate([empty, *carried], axis=1), tool)
+    if cut.untouched.sum() == len(shape.faces) and len(cut.faces) == len(shape.faces):
+        return shape
+    if not len(cut.faces):
+        return None
+    return _assembled(shape, cut)
+
+
+def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:
+    """The pieces of the base first, then the cut's faces; vertices that nothing uses any more are left out."""
+    own = cut.source < 0
+    used, kept = np.unique(cut.faces[~own], return_inverse=True)
+    corners = cut.vertices[cut.faces[own]]
+    rows = [corners.reshape(-1, 3)]
+    vertex_of = np.unique(rows[0], axis=0, return_inverse=True)[1].reshape(-1)
+    area = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    whole = np.stack([np.bincount(vertex_of, weights=area[:, axis]) for axis in range(3)], axis=1)
+    face, weights = MeshDistance(shape.vertices, shape.faces).nearest(corners.mean(axis=1))
+    start, made = 0, {}
+    for key in ("normals", "uv", "colours"):
+        values = getattr(shape, key)
+        if values is None:
+            continue
+        width = values.shape[1]
+        ours = cut.attributes[used, start : start + width].astype(np.float32)
+        if key == "normals":
+            new = used >= len(shape.vertices)
+            ours[new] = _unit(ours[new])
+            added = _unit(whole[vertex_of])
+        else:
+            added = np.repeat(np.einsum("ij,ijk->ik", weights, values[shape.faces[face]]), 3, axis=0)
+        rows.append(added)
+        made[key], start = ours, start + width
+    merged, place = np.unique(np.concatenate(rows, axis=1).astype(np.float32), axis=0, return_inverse=True)
+    vertices = np.concatenate([cut.vertices[used].astype(np.float32), merged[:, :3]])
+    start = 3
+    for key, ours in made.items():
+        made[key] = np.concatenate([ours, merged[:, start : start + ours.shape[1]]])
+        start += ours.shape[1]
+    faces = np.concatenate([kept.reshape(-1, 3), place.reshape(-1, 3) + len(used)])
+    return replace(shape, vertices=vertices, faces=faces, **made)
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+
+
+def _boxes_meet(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.all(one.min(axis=0) <= other.max(axis=0)) and np.all(other.min(axis=0) <= one.max(axis=0)))
+
+
+def _volume(shape: BaseShape) -> float:
+    vertices, faces, _ = shape.in_user_frame()
+    return TriangleMesh(shape.name, vertices, faces).volume()
+
+
+def _plain(vertices: np.ndarray, faces: np.ndarray) -> manifold3d.Mesh64:
+    """Welded by position."""
+    rows, weld = np.unique(np.asarray(vertices, np.float64) + 0.0, axis=0, return_inverse=True)
+    welded = weld.reshape(-1)[faces]
+    distinct = (np.diff(np.sort(welded, axis=1), axis=1) > 0).all(axis=1)
+    return manifold3d.Mesh64(rows, np.array(welded[distinct], dtype=np.uint64, order="C"))
+
+
+def _manifold(solid: Solid) -> manifold3d.Manifold:
+    return manifold3d.Manifold(_plain(solid.vertices, solid.faces))
+
+
+def _solid(pieces: list[manifold3d.Manifold]) -> Solid:
+    if not pieces:
+        return Solid(np.zeros((0, 3)), np.zeros((0, 3)))
+    mesh = reduce(lambda a, b: a + b, pieces).to_mesh64()
+    return Solid(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts))

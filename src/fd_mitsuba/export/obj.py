@@ -1,0 +1,124 @@
+"""Wavefront OBJ with an MTL of PBR maps, and PLY with normals and UVs."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from fd_mitsuba.export.material import PbrMaterial
+from fd_mitsuba.export.pictures import Picture, srgb_from_linear
+
+
+@dataclass(frozen=True)
+class ObjMesh:
+    """A group of an OBJ file, in the user frame.
+
+    Attributes:
+        name: of object, group and material.
+        vertices: (V, 3).
+        faces: (F, 3).
+        normals: (V, 3) unit, None to leave them out.
+        uv: (V, 2), origin top left; written with the origin bottom left, as OBJ has it.
+        colours: (V, 3) linear; written behind the position, as sRGB, which is how they are read.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    material: PbrMaterial
+    normals: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    colours: np.ndarray | None = None
+
+
+def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:
+    """File name -> bytes: the OBJ, its MTL and the pictures. Numbers are exact for float32."""
+    files: dict[str, bytes] = {}
+    lines = [f"mtllib {name}.mtl"]
+    materials: list[str] = []
+    positions = places = directions = 0
+    for mesh in meshes:
+        materials += _material_lines(mesh.name, mesh.material, files)
+        lines += [f"o {mesh.name}", f"g {mesh.name}", f"usemtl {mesh.name}"]
+        rows = np.asarray(mesh.vertices, dtype=np.float32)
+        if mesh.colours is not None:
+            rows = np.concatenate([rows, srgb_from_linear(mesh.colours).astype(np.float32)], axis=1)
+        lines += _rows("v", rows)
+        corner = [mesh.faces + positions + 1]
+        if mesh.uv is not None:
+            flipped = np.stack([mesh.uv[:, 0], 1.0 - np.asarray(mesh.uv[:, 1], dtype=np.float64)], axis=1)
+            lines += _rows("vt", flipped)
+            corner.append(mesh.faces + places + 1)
+            places += len(mesh.uv)
+        if mesh.normals is not None:
+            lines += _rows("vn", mesh.normals)
+            corner.append(mesh.faces + directions + 1)
+            directions += len(mesh.normals)
+        positions += len(mesh.vertices)
+        pattern = {1: "{0}", 2: "{0}/{1}" if mesh.uv is not None else "{0}//{1}", 3: "{0}/{1}/{2}"}[len(corner)]
+        word = pattern.format("%d", "%d", "%d")
+        face = f"f {word} {word} {word}"
+        numbers = np.stack(corner, axis=2).reshape(len(mesh.faces), -1)
+        lines += [face % tuple(row) for row in numbers.tolist()]
+    files[f"{name}.obj"] = ("\n".join(lines) + "\n").encode("utf-8")
+    files[f"{name}.mtl"] = ("\n".join(materials) + "\n").encode("utf-8")
+    return files
+
+
+def ply_with_uv(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> bytes:
+    """A binary PLY of vertices (V, 3), unit normals (V, 3) and uv (V, 2) with the origin bottom left, all float32.
+
+    Mitsuba wants `flip_tex_coords` for it.
+    """
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t")]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    flipped = np.stack([uv[:, 0], 1.0 - np.asarray(uv[:, 1], dtype=np.float64)], axis=1)
+    columns = np.concatenate([vertices, normals, flipped], axis=1)
+    rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    rows["count"], rows["index"] = 3, faces
+    return "\n".join(header).encode("ascii") + np.ascontiguousarray(columns, "<f4").tobytes() + rows.tobytes()
+
+
+def _rows(word: str, values: np.ndarray) -> list[str]:
+    line = " ".join([word] + ["%.9g"] * values.shape[1])
+    return [line % tuple(row) for row in values.tolist()]
+
+
+def _material_lines(name: str, material: PbrMaterial, files: dict[str, bytes]) -> list[str]:
+    lines = [f"newmtl {name}", "Kd {:.6g} {:.6g} {:.6g}".format(*material.base_color)]
+    lines += ["Ks 0.5 0.5 0.5" if material.specular else "Ks 0 0 0", f"Ni {material.ior:.6g}"]
+    lines += [f"d {material.opacity * (1 - material.transmission):.6g}", "illum 2"]
+    packed = material.orm_picture is not None
+    lines += [f"Pr {1 if packed else material.roughness:.6g}", f"Pm {1 if packed else material.metallic:.6g}"]
+    if material.base_picture is not None:
+        lines.append(f"map_Kd {_options(material.base_picture)}{_put(files, material.base_picture)}")
+    if material.orm_picture is not None:
+        pixels = material.orm_picture.pixels()
+        stem = material.orm_picture.name.removesuffix("_orm")
+        for word, channel, label in (("map_Pr", 1, "roughness"), ("map_Pm", 2, "metallic")):
+            stream = io.BytesIO()
+            Image.fromarray(pixels[..., channel]).save(stream, format="PNG")
+            picture = Picture(f"{stem}_{label}", stream.getvalue())
+            lines.append(f"{word} {_options(material.orm_picture)}{_put(files, picture)}")
+    if material.normal_picture is not None:
+        place = f"{_options(material.normal_picture)}{_put(files, material.normal_picture)}"
+        # `norm` is the PBR extension's word, `map_Bump` is the one that more programs know.
+        lines += [f"norm {place}", f"map_Bump {place}"]
+    return [*lines, ""]
+
+
+def _options(picture: Picture) -> str:
+    (u, v), (scale_u, scale_v) = picture.tiling
+    tiled = picture.tiling != ((0.0, 0.0), (1.0, 1.0))
+    # v runs the other way here: 1 - (v + s (1 - w)) = (1 - v - s) + s w
+    text = f"-o {u:.6g} {1 - v - scale_v:.6g} 0 -s {scale_u:.6g} {scale_v:.6g} 1 " if tiled else ""
+    return text + ("-clamp on " if picture.wrap == "clamp" else "")
+
+
+def _put(files: dict[str, bytes], picture: Picture) -> str:
+    files[picture.file_name] = picture.data
+    return picture.file_name

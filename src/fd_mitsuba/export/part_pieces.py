@@ -1,0 +1,128 @@
+"""The pieces that a part falls into on the tetrahedral grid: bridged, left out, filled before a surface is made.
+
+Vertices are connected along the grid's edges, so pieces here are exactly those of the extracted surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from fd_mitsuba.extraction.tet_grid import TetGrid
+
+ISLAND_SHARE = 0.01
+"""A piece with less than this share of its named part's volume is a stray island."""
+
+BRIDGE_REACH = 0.1
+"""The part swells by at most this, canonical units, to reach the base; what stays farther away is meant to float."""
+
+
+def keep_large(grid: TetGrid, inside: Tensor, sdf_part: Tensor, owner: Tensor) -> tuple[Tensor, list[int]]:
+    """`inside` (count,) without stray islands, and how many islands each named part lost.
+
+    A piece counts by the volume of the part in it: what is fillet only has none, goes too, and is not counted.
+
+    Args:
+        inside: (count,) bool.
+        sdf_part: (count,) inside positive, canonical units.
+        owner: (count,) number of the named part that a vertex belongs to.
+    """
+    label, count = _label(grid, inside)
+    shares = _part_shares(grid, label, count, sdf_part, owner)
+    stray = shares.max(axis=0) < ISLAND_SHARE
+    stray[0] = True
+    removed = [int(((shares.argmax(axis=0) == i) & stray & (shares[i] > 0))[1:].sum()) for i in range(len(shares))]
+    return inside & torch.from_numpy(~stray[label]).view(-1), removed
+
+
+def fill_pockets(grid: TetGrid, inside: Tensor, fillable: Tensor) -> Tensor:
+    """`inside` (count,) with every enclosed void filled that is `fillable` (count,) throughout."""
+    label, count = _label(grid, ~inside)
+    border = grid.is_border(torch.arange(grid.count)).numpy()
+    keep = np.zeros(count + 1, dtype=bool)
+    keep[label.reshape(-1)[border | ~fillable.numpy()]] = True
+    keep[0] = True
+    return inside | torch.from_numpy(~keep[label]).view(-1)
+
+
+def bridge_gaps(
+    grid: TetGrid, sdf_base: Tensor, sdf_part: Tensor, owner: Tensor, inside_of: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, float]:
+    """`sdf_part` (count,) swollen towards the base where a piece ends just before it, and by how much at most.
+
+    A piece is joined to the base if it has a vertex inside it. One that is not, though it is large, swells near its
+    end: with gap g to the base and swelling a, sdf_part grows by a clamp((g + 2 a + sdf_base) / 2 a, 0, 1), all of a up
+    to a distance g from the base and nothing beyond g + 2 a. That grows half as fast as sdf_part falls, so the part's
+    surface stays one. The smallest a that joins is taken, in steps of half a cell, and half a cell more, so that the
+    joint is no mere thread. A piece that would need more than `BRIDGE_REACH` stays as it was.
+
+    Args:
+        inside_of: the solid (count,) bool that belongs to a `sdf_part`.
+    """
+    inside = inside_of(sdf_part)
+    label, count = _label(grid, inside)
+    large = _part_shares(grid, label, count, sdf_part, owner).max(axis=0) >= ISLAND_SHARE
+    floating = [piece for piece in range(1, count + 1) if large[piece] and not _joined(label == piece, sdf_base)]
+    if not floating:
+        return sdf_part, 0.0
+    nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    nearest_piece = torch.from_numpy(label[tuple(nearest)]).view(-1)
+    bridged, most, half_cell = sdf_part, 0.0, grid.spacing / 2
+    for piece in floating:
+        own, core = nearest_piece == piece, torch.from_numpy(label == piece).view(-1)
+        seed = int(torch.where(core, sdf_part, -torch.inf).argmax())
+        gap = float(-sdf_base[core].max())
+        for step in range(1, int((BRIDGE_REACH - half_cell) / half_cell) + 1):
+            if not _reaches(grid, inside_of(_swollen(sdf_part, sdf_base, own, gap, step * half_cell)), seed, sdf_base):
+                continue
+            swelling = (step + 1) * half_cell
+            bridged = torch.maximum(bridged, _swollen(sdf_part, sdf_base, own, gap, swelling))
+            most = max(most, swelling)
+            break
+    return bridged, most
+
+
+def distance_to(grid: TetGrid, marked: Tensor) -> Tensor:
+    """Distance (count,) of every vertex of the grid to the nearest marked one, canonical units; infinite without."""
+    if not bool(marked.any()):
+        return torch.full((grid.count,), torch.inf)
+    distance = ndimage.distance_transform_edt(~marked.view((grid.side,) * 3).numpy(), sampling=grid.spacing)
+    return torch.from_numpy(distance).view(-1).float()
+
+
+def _swollen(sdf_part: Tensor, sdf_base: Tensor, where: Tensor, gap: float, swelling: float) -> Tensor:
+    weight = ((gap + 2 * swelling + sdf_base) / (2 * swelling)).clamp(0, 1)
+    return sdf_part + swelling * weight * where
+
+
+def _reaches(grid: TetGrid, inside: Tensor, seed: int, sdf_base: Tensor) -> bool:
+    label, _ = _label(grid, inside)
+    return _joined(label == label.reshape(-1)[seed], sdf_base)
+
+
+def _joined(piece: np.ndarray, sdf_base: Tensor) -> bool:
+    return bool((sdf_base.numpy()[piece.reshape(-1)] > 0).any())
+
+
+def _label(grid: TetGrid, marked: Tensor) -> tuple[np.ndarray, int]:
+    """The number (z, y, x) of each marked vertex's piece, from 1 on, and how many there are."""
+    along = np.zeros((3, 3, 3), dtype=bool)
+    along[1:, 1:, 1:] = True
+    structure = along | along[::-1, ::-1, ::-1]
+    return ndimage.label(marked.view((grid.side,) * 3).numpy(), structure)
+
+
+def _part_shares(grid: TetGrid, label: np.ndarray, count: int, sdf_part: Tensor, owner: Tensor) -> np.ndarray:
+    """Which share of a named part's volume lies in a piece, (parts, 1 + count); the first column is not used."""
+    volume = (0.5 + sdf_part / grid.spacing).clamp(0, 1).numpy()
+    volume = np.where(sdf_part.numpy() > 0, volume, 0.0)
+    shares = np.zeros((int(owner.max()) + 1, count + 1))
+    for number, row in enumerate(shares):
+        row += np.bincount(label.reshape(-1), weights=volume * (owner.numpy() == number), minlength=count + 1)
+        row[0] = 0.0
+        row /= max(row.sum(), 1e-30)
+    return shares

@@ -1,0 +1,112 @@
+"""The scene of the appearance stage: base and parts side by side under the scene's own lights, in the user's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.mitsuba_api import FACES, VERTICES
+from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
+from fd_mitsuba.render.upload import upload_floats, upload_indices
+from fd_mitsuba.scene.edit_scene import EditScene
+
+_NOT_RENDERED = ("focal_region", "sensor", "integrator")
+
+
+class Triangles(Protocol):
+    """A closed mesh, canonical frame, outward faces."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class AppearanceScene:
+    """Built once per run.
+
+    Attributes:
+        lit: everything, for shadows and bounces.
+        visible: what a camera sees: shapes that are lights are left out, as by Mitsuba's `hide_emitters`.
+        parts: the parts' meshes, in the order of the names.
+        base_shapes: the scene file's own shapes that are not lights, with their own BSDFs.
+    """
+
+    lit: mi.Scene
+    visible: mi.Scene
+    parts: tuple[mi.Mesh, ...]
+    base_shapes: tuple[Any, ...]
+
+    @classmethod
+    def build(
+        cls, scene: EditScene, parts: Mapping[str, Triangles], shading: PartShading, bounces: bool
+    ) -> AppearanceScene:
+        """Load the scene file once more and put the parts into it.
+
+        Args:
+            bounces: whether light may go on from a part's surface; if not, nobody asks for its BSDF there.
+
+        Raises:
+            UserError: the scene has no emitter, or an emitter holds values that are not finite.
+            ValueError: a part is empty, not finite, or an index is out of range.
+        """
+        loaded = scene.mitsuba_scene(without=_NOT_RENDERED)
+        if not loaded.emitters():
+            raise UserError(
+                f'{scene.path}: no emitter: nothing would be lit; add <emitter type="envmap"> or another light'
+            )
+        for emitter in loaded.emitters():
+            _check_emitter(scene, emitter)
+        meshes = tuple(_part_mesh(name, solid, scene, shading if bounces else None) for name, solid in parts.items())
+        lamps = [shape for shape in loaded.shapes() if shape.is_emitter()]
+        base = [shape for shape in loaded.shapes() if not shape.is_emitter()]
+        # A light with a shape comes along with that shape.
+        lights = [light for light in loaded.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Surface)]
+        lit = _scene([*base, *meshes, *lamps, *lights])
+        visible = _scene([*base, *meshes]) if lamps else lit
+        return cls(lit, visible, meshes, tuple(base))
+
+    def set_vertex_values(self, part: int, values: Mapping[str, np.ndarray]) -> None:
+        """What further bounces see on a part: BSDF values, field -> (V, C), one row for each of its vertices."""
+        parameters = mi.traverse(self.parts[part])
+        for name, value in values.items():
+            key = f"vertex_{name}"
+            if key not in parameters:
+                continue
+            if np.size(value) != dr.width(parameters[key]):
+                raise ValueError(f"{name}: {np.shape(value)} values do not fit the part's vertices")
+            parameters[key] = upload_floats(np.asarray(value))
+        parameters.update()
+
+
+def _scene(objects: list[Any]) -> mi.Scene:
+    content = {f"object_{number}": value for number, value in enumerate(objects)}
+    return mi.load_dict({"type": "scene", **content}, optimize=False, parallel=False)
+
+
+def _part_mesh(name: str, solid: Triangles, scene: EditScene, shading: PartShading | None) -> mi.Mesh:
+    vertices, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError(f"part {name!r}: {len(vertices)} vertices, {len(faces)} faces: empty, not finite or bad index")
+    properties = mi.Properties()
+    properties["bsdf"] = bounce_shading(shading) if shading else mi.load_dict({"type": "diffuse"})
+    mesh = mi.Mesh(name, len(vertices), len(faces), props=properties, has_vertex_normals=True)
+    for field in shading.feeds if shading else ():
+        mesh.add_attribute(f"vertex_{field}", CHANNELS[field], [0.5] * (CHANNELS[field] * len(vertices)))
+    parameters = mi.traverse(mesh)
+    parameters[VERTICES] = upload_floats(scene.frame.to_user(vertices))
+    parameters[FACES] = upload_indices(faces)
+    parameters.update()
+    return mesh
+
+
+def _check_emitter(scene: EditScene, emitter: Any) -> None:
+    for name, value in mi.traverse(emitter).items():
+        if name.endswith("data") and not bool(dr.all(dr.isfinite(dr.ravel(value)))):
+            what = f'emitter "{emitter.id()}"'
+            raise UserError(f"{scene.path}: {what}: its picture has pixels that are NaN or infinite; use another one")

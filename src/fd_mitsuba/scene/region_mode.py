@@ -1,0 +1,82 @@
+"""What a focal region is for: to add a part to the base, or to cut the part out of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fd_mitsuba.scene.focal_region import ADD, SUBTRACT, FocalRegion
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.scene_file import SceneElement
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
+
+_REACH = 0.15
+"""How far beyond its regions a part may grow: that of `extraction.surface`, a later layer."""
+
+
+def region_mode(element: SceneElement) -> str:
+    """The region's `mode`, `ADD` unless the scene says otherwise; UserError for anything unknown."""
+    mode = element.properties.get("mode", ADD)
+    if mode not in (ADD, SUBTRACT):
+        raise element.error(f"mode {mode!r} is unknown; write {ADD!r} or {SUBTRACT!r}")
+    return str(mode)
+
+
+def check_modes(
+    elements: list[SceneElement],
+    regions: tuple[FocalRegion, ...],
+    base: tuple[TriangleMesh, ...],
+    frame: Normalisation,
+    gaps: list[float],
+) -> None:
+    """Refuse regions that disagree, and cuts that cannot be made.
+
+    Args:
+        elements: of the regions, in their order.
+        base: the meshes in the user frame.
+        gaps: distance between each region and the base, 0 where they overlap.
+
+    Raises:
+        UserError: adding and subtracting in one scene; a cut that misses the base, takes all of it, or comes near a
+            mesh that encloses nothing.
+    """
+    for element, region, gap in zip(elements, regions, gaps, strict=True):
+        if region.mode != regions[0].mode:
+            both = f"{region.mode}s, while {regions[0].name!r} {regions[0].mode}s"
+            if region.part == regions[0].part:
+                raise element.error(f"{both}, and both are of part {region.part!r}; give them one mode")
+            raise element.error(f"{both}; give all regions one mode, and edit in two runs")
+        if region.mode == SUBTRACT and gap > 0:
+            raise element.error("does not reach the base, so nothing can be cut out; move it into the base")
+    if regions[0].mode != SUBTRACT:
+        return
+    left = False
+    for mesh in base:
+        points = frame.to_canonical(mesh.vertices)
+        near = False
+        for element, region in zip(elements, regions, strict=True):
+            if not near and _reaches(region, points, mesh):
+                near = True
+                _check_solid(element, mesh)
+        depth = [region.sdf(points) for region in regions]
+        left = left or not near or bool((sum(d > 0 for d in depth) == 0).any())
+    if not left:
+        raise elements[0].error("takes all of the base away; shrink it")
+
+
+def _reaches(region: FocalRegion, points: np.ndarray, mesh: TriangleMesh) -> bool:
+    """Whether a part of that region can touch the mesh, whose canonical vertices are `points`."""
+    if float(region.sdf(points).max()) > -_REACH:
+        return True
+    return float(MeshDistance(points, mesh.faces).unsigned(region.surface(3).vertices).min()) < _REACH
+
+
+def _check_solid(element: SceneElement, mesh: TriangleMesh) -> None:
+    found = topology(mesh.vertices, mesh.faces)
+    if not found.closed or found.nonmanifold_edges:
+        problem = f"is not closed ({found.boundary_edges} boundary edges)"
+        if found.nonmanifold_edges:
+            problem = f"has {found.nonmanifold_edges} edges of more than two faces"
+        raise element.error(f"base {mesh.name!r} {problem}, so nothing can be cut out of it; repair it")
+    if not mesh.volume() > 0:
+        raise element.error(f"base {mesh.name!r} has its faces pointing inwards, so nothing can be cut; flip them")

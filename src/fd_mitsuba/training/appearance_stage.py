@@ -1,0 +1,262 @@
+"""One step of the appearance stage: texture field -> lit pictures -> guidance and style losses -> optimiser.
+
+L_app = lambda_sds L_SDS + lambda_style (L_g + lambda_boundary L_b)  (paper, "Appearance Editing" and supplement
+"Appearance Learning"). The base has no parameter here: what it looks like comes from the scene file alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.fields.texture import TextureField, TextureValues
+from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
+from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
+from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.render.part_shading import PartShading
+from fd_mitsuba.render.tonemap import auto_exposure, to_linear, to_srgb
+from fd_mitsuba.scene.base_appearance import BaseAppearance
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
+from fd_mitsuba.scene.part_material import part_material
+from fd_mitsuba.scene.views import CameraBatch, sample_views
+from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.sheets import appearance_sheet
+from fd_mitsuba.training.style_consistency import StyleConsistency, learn_base_material
+from fd_mitsuba.training.surface_points import Triangles, points_on
+
+_POOL = 32768
+"""Points on the parts' surface that the style losses choose from."""
+_CLAY_LEVEL = 0.45
+"""Linear luminance that the exposure gives to the brightest part of the base in clay, whose base colour is 0.5."""
+_INITIAL_STEPS = 300
+"""Steps in which the single path's field learns the base's own material before the guidance starts."""
+
+
+@dataclass(frozen=True)
+class AppearanceRecord:
+    """What one step reports: numbers, the linear pictures without gradients, and what the field said at the points."""
+
+    values: dict[str, float]
+    gbuffer: GBuffer
+    pictures: AppearancePictures
+    texture: TextureValues
+    exposure: float
+    preview: Tensor | None
+
+    def sheet(self) -> np.ndarray | None:
+        """The views, both paths, the mask, the field's maps, and the guidance's estimate."""
+        return appearance_sheet(self.gbuffer, self.pictures, self.texture, self.exposure, self.preview)
+
+
+class AppearanceStage:
+    """Everything that the appearance stage holds between steps; its random numbers depend on (seed, step) only.
+
+    Args:
+        scene: what to edit; its emitters light it.
+        config: how.
+        parts: name -> closed mesh of the part, canonical frame, as the geometry stage left it.
+        guidance: the source of the image loss; its prompt must be set. None leaves the image loss out.
+        say: takes remarks for the user, a line each.
+
+    Raises:
+        UserError: no light, a part material without anything to learn, views that do not fill the model's mosaic.
+    """
+
+    name = "appearance"
+
+    def __init__(
+        self,
+        scene: EditScene,
+        config: RunConfig,
+        parts: Mapping[str, Triangles],
+        guidance: AppearanceGuidance | None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        settings = config.appearance
+        mosaic = guidance.view_grid**2 if guidance is not None else 1
+        if settings.views % mosaic:
+            raise UserError(
+                f"appearance.views = {settings.views}: {config.guidance.model} sees {mosaic} views at once; "
+                f"set appearance.views to a multiple of {mosaic}"
+            )
+        self.scene, self.config, self.parts, self.guidance = scene, config, dict(parts), guidance
+        self.steps = settings.steps
+        self.counters: dict[str, int] = {}
+        self.material = part_material(scene, settings.fixed, settings.normal_map)
+        say(self.material.message)
+        seed = seed_for(config.seed, Purpose.TEXTURE)
+        self.field = TextureField(config.texture, seed, self.material.start, self.material.learned)
+        self.optimiser = torch.optim.AdamW(
+            self.field.parameters(),
+            lr=settings.learning_rate,
+            betas=settings.betas,
+            eps=settings.eps,
+            weight_decay=settings.weight_decay,
+            fused=True,
+        )
+        size = settings.picture_size or (guidance.appearance_size if guidance is not None else 128)
+        self.shading = PartShading.of(self.material)
+        self.rendering = AppearancePass(
+            scene, self.parts, self.shading, size, settings.spp, settings.max_depth, settings.single_path
+        )
+        corners = np.concatenate([np.asarray(mesh.vertices) for mesh in self.parts.values()])
+        self.focus = bounding_ball(corners)
+        self.aim = centre_of_box(np.concatenate([scene.base_canonical.vertices, corners]))
+        self.exposure = settings.exposure or self._exposure()
+        self._points = points_on(self.parts.values(), _POOL, seed_for(config.seed, Purpose.STYLE))
+        self.style = self._style(say)
+
+    def phase_name(self, step: int) -> str:
+        """The name that the progress line shows."""
+        return self.name
+
+    def cameras(self, step: int) -> tuple[CameraBatch, bool]:
+        """The step's views, and whether they are close-ups of the part."""
+        settings, seed = self.config.cameras, seed_for(self.config.seed, Purpose.APPEARANCE_VIEWS, step)
+        closeup = bool(np.random.default_rng((seed, 1)).random() < settings.focus_fraction)
+        together = self.guidance.view_grid**2 if self.guidance is not None else 1
+        views = sample_views(
+            settings,
+            self.config.appearance.views,
+            seed,
+            focus=self.focus if closeup else None,
+            centre=self.aim if settings.aim == "object" else None,
+            together=together,
+        )
+        return views, closeup
+
+    def texture(self, gbuffer: GBuffer) -> TextureValues:
+        """What the field says at the points that are seen, with gradients."""
+        return self.field(gbuffer.points)
+
+    def render(self, gbuffer: GBuffer, texture: TextureValues, seed: int) -> AppearancePictures:
+        """The lit pictures of a traced view for given field values."""
+        fed = {name: getattr(texture, name) for name in ("base_color", "roughness", "metallic")}
+        normal = texture.normal if "normal" in self.material.learned else None
+        return self.rendering.render(gbuffer, **fed, normal=normal, seed=seed)
+
+    def step(self, step: int) -> AppearanceRecord:
+        """Run step `step` (counted from 0) and change the field once.
+
+        Raises:
+            RunStopped: a value that is not finite.
+        """
+        settings = self.config.appearance
+        cameras, closeup = self.cameras(step)
+        seed = seed_for(self.config.seed, Purpose.APPEARANCE_PIXELS, step)
+        gbuffer = self.rendering.trace(cameras, seed)
+        texture = self.texture(gbuffer)
+        losses: dict[str, Tensor] = {}
+        values: dict[str, float] = {"part_pixels": float(len(gbuffer.points))}
+        preview = None
+        pictures = self.render(gbuffer, texture, seed)
+        if self.guidance is not None and settings.lambda_sds > 0:
+            views = AppearanceViews(
+                pictures=self._finished(pictures.merged, pictures.alpha, step),
+                condition=self._condition(gbuffer, pictures, seed, step),
+                mask=gbuffer.alpha,
+                part_mask=gbuffer.part_mask,
+                azimuth_deg=cameras.azimuth_deg,
+                elevation_deg=cameras.elevation_deg,
+                closeup=closeup,
+            )
+            guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
+            result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
+            losses["sds"], preview = result.loss, result.preview
+            values.update(result.logs)
+        if self.style is not None:
+            losses.update(self.style.losses(self.field, step))
+        weights = {
+            "sds": settings.lambda_sds,
+            "style_gradient": settings.lambda_style,
+            "style_boundary": settings.lambda_style * settings.lambda_boundary,
+        }
+        total = sum(weights[name] * loss for name, loss in losses.items())
+        values.update({f"loss_{name}": float(loss.detach()) for name, loss in losses.items()})
+        values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
+        if not np.isfinite(values["loss"]):
+            raise RunStopped(f"step {step}: the loss is not finite; lower appearance.learning_rate")
+        if isinstance(total, Tensor) and total.requires_grad:
+            self.optimiser.zero_grad(set_to_none=True)
+            total.backward()
+            self._check_gradients(step)
+            self.optimiser.step()
+        shown = _detached(pictures), _without_gradient(texture)
+        return AppearanceRecord(values, gbuffer, *shown, self.exposure, preview)
+
+    def check_field(self, step: int) -> dict[str, float]:
+        """The parts' mean base colour, roughness and metallic; raises RunStopped for a field that is not finite."""
+        with torch.no_grad():
+            texture = self.field(self._points[:1024])
+        means = torch.cat([texture.base_color, texture.roughness, texture.metallic], 1).mean(0)
+        if not torch.isfinite(means).all():
+            raise RunStopped(f"step {step}: the texture field is not finite; lower appearance.learning_rate")
+        names = ("mean_red", "mean_green", "mean_blue", "mean_roughness", "mean_metallic")
+        return dict(zip(names, means.tolist(), strict=True))
+
+    @torch.no_grad()
+    def set_bounces(self) -> None:
+        """Tell the light that bounces what the parts look like now; of no use where max_depth is 2."""
+        for name, mesh in self.parts.items():
+            texture = self.field(torch.from_numpy(np.asarray(mesh.vertices, np.float32)))
+            values = {channel: getattr(texture, channel).numpy() for channel in self.material.feeds}
+            self.rendering.set_vertex_values(name, values)
+
+    def _finished(self, linear: Tensor, alpha: Tensor, step: int) -> Tensor:
+        """sRGB in [0, 1] over the configured background."""
+        return to_srgb(linear * self.exposure + (1 - alpha) * self._background(step, len(linear)))
+
+    def _background(self, step: int, count: int) -> Tensor:
+        kind = self.config.appearance.background
+        if kind == "random":
+            generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.BACKGROUND, step))
+            return to_linear(torch.rand(count, 3, 1, 1, generator=generator))
+        return torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
+
+    @torch.no_grad()
+    def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:
+        """The same views with the part in plain grey clay, for models that are shown what they edit."""
+        if not self.guidance.needs_base:
+            return None
+        clay_part = self.rendering.render_clay(gbuffer, seed)
+        return self._finished(clay_part + pictures.base_path, pictures.alpha, step)
+
+    def _style(self, say: Callable[[str], None]) -> StyleConsistency | None:
+        settings, seed = self.config.appearance, self.config.seed
+        if not (settings.style or settings.single_path):
+            return None
+        base = BaseAppearance(self.scene)
+        for remark in base.unreadable:
+            say(remark)
+        if settings.single_path:
+            points = points_on([self.scene.base_canonical], _POOL, seed_for(seed, Purpose.BASE_MATERIAL))
+            learn_base_material(self.field, base, points, settings.learning_rate, _INITIAL_STEPS, seed)
+        return StyleConsistency(base, self._points, settings, seed, say) if settings.style else None
+
+    def _exposure(self) -> float:
+        """By the light alone: the base in clay under it, so that a dark base does not make a white part glare."""
+        cameras = CameraBatch.around(np.arange(4) * 90.0 + 20.0, 20.0, 3.4, 45.0, np.tile(self.aim, (4, 1)))
+        seed = seed_for(self.config.seed, Purpose.EXPOSURE)
+        whole = AppearancePass(self.scene, {}, self.shading, 64, 16, deferred_base=True)
+        gbuffer = whole.trace(cameras, seed)
+        return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.part_mask, _CLAY_LEVEL)
+
+    def _check_gradients(self, step: int) -> None:
+        for parameter in self.field.parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                raise RunStopped(f"step {step}: a gradient is not finite; lower appearance.learning_rate")
+
+
+def _detached(pictures: AppearancePictures) -> AppearancePictures:
+    return AppearancePictures(**{name: value.detach() for name, value in vars(pictures).items()})
+
+
+def _without_gradient(texture: TextureValues) -> TextureValues:
+    return TextureValues(**{name: value.detach() for name, value in vars(texture).items()})

@@ -1,0 +1,141 @@
+"""Behaviour of the appearance stage with a guidance that is known in closed form: a colour that it asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.evaluation.lit_views import ring_cameras
+from fd_mitsuba.evaluation.preservation import measure_preservation
+from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult
+from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.training.appearance_stage import AppearanceStage
+from fd_mitsuba.training.loop import run_stage
+from fd_mitsuba.training.record import read_metrics
+
+RED = torch.tensor([0.9, 0.1, 0.1]).view(1, 3, 1, 1)
+
+
+class AskForColour:
+    """Wants the pixels that show the part to be one sRGB colour."""
+
+    needs_base = False
+    view_grid = 1
+    appearance_size = 24
+
+    def __init__(self, colour: torch.Tensor) -> None:
+        self.colour = colour
+
+    def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
+        wrong = (views.pictures - self.colour).square() * views.part_mask
+        return GuidanceResult(wrong.sum() / views.part_mask.sum().clamp(min=1))
+
+
+@pytest.fixture
+def scene(make_scene: Callable[..., Path]) -> EditScene:
+    return load_edit_scene(make_scene())
+
+
+@pytest.fixture
+def lump(scene: EditScene) -> SimpleNamespace:
+    """A ball that sits on the animal's back, sunk in a little."""
+    vertices, faces = unit_sphere()
+    top = scene.base_canonical.vertices[:, 1].max()
+    return SimpleNamespace(vertices=0.25 * np.asarray(vertices) + [0, 0.5 * top + 0.2, 0], faces=np.asarray(faces))
+
+
+def settings(**appearance: object) -> RunConfig:
+    values = {"steps": 40, "views": 2, "spp": 2, "background": "black", "learning_rate": 2e-2, "exposure": 1.0}
+    texture = {"levels": 4, "finest_resolution": 16, "log2_table": 12}
+    return RunConfig.model_validate({"appearance": {**values, **appearance}, "texture": texture, "seed": 3})
+
+
+def trained(scene: EditScene, lump: SimpleNamespace, **appearance: object) -> AppearanceStage:
+    stage = AppearanceStage(scene, settings(**appearance), {"part": lump}, AskForColour(RED), lambda line: None)
+    for step in range(stage.steps):
+        stage.step(step)
+    return stage
+
+
+def mean_colour(stage: AppearanceStage) -> torch.Tensor:
+    figures = stage.check_field(0)
+    return torch.tensor([figures["mean_red"], figures["mean_green"], figures["mean_blue"]])
+
+
+def test_the_part_takes_the_colour_that_is_asked_for(scene: EditScene, lump: SimpleNamespace) -> None:
+    red, green, blue = mean_colour(trained(scene, lump))
+    assert red > 2.5 * green and red > 2.5 * blue
+
+
+def test_style_consistency_ties_the_part_to_the_base(scene: EditScene, lump: SimpleNamespace) -> None:
+    """With it, the colour step across the boundary is at most half of that without; the base here is a grey 0.5."""
+    steps = {}
+    for style in (False, True):
+        stage = trained(scene, lump, style=style, lambda_sds=0.3, boundary_reach=0.08)
+        if style:
+            places, colours = stage.style.boundary, stage.style.beside.base_color
+        steps[style] = stage
+    difference = {
+        style: float((stage.field(places).base_color - colours).abs().mean().detach()) for style, stage in steps.items()
+    }
+    assert len(places) > 100
+    assert difference[True] < 0.5 * difference[False]
+
+
+def test_the_dual_path_leaves_the_base_and_a_single_path_does_not(scene: EditScene, lump: SimpleNamespace) -> None:
+    cameras = ring_cameras(4, np.zeros(3))
+    drift = {}
+    for single in (False, True):
+        stage = trained(scene, lump, single_path=single, steps=15)
+        gbuffer = stage.rendering.trace(cameras, 0, size=32, spp=4)
+        with torch.no_grad():
+            after = stage.render(gbuffer, stage.texture(gbuffer), 0)
+        alone = AppearancePass(scene, {"part": lump}, stage.shading, 32, 4)
+        plain = alone.trace(cameras, 0, size=32, spp=4)
+        truth = alone.render_base(plain, 0)
+        seen = (plain.base_mask > 0.999).expand(-1, 3, -1, -1)
+        picture = after.merged if single else after.base_path
+        drift[single] = float((picture - truth)[seen].abs().mean())
+    assert drift[False] == 0.0 and drift[True] > 1e-3
+
+
+def test_base_pixels_are_those_of_the_base_alone(scene: EditScene, lump: SimpleNamespace) -> None:
+    stage = trained(scene, lump, steps=2)
+    alone = AppearancePass(scene, {}, stage.shading, 24, 2)
+    kept = measure_preservation(stage.rendering, alone, ring_cameras(4, np.zeros(3)), 1.0, 48, 4)
+    assert kept.base_psnr_db >= 60 and kept.mask_error == 0 and kept.untouched_share > 0.05
+
+
+def test_resuming_goes_on_exactly(scene: EditScene, lump: SimpleNamespace, tmp_path: Path) -> None:
+    def fresh(steps: int = 6) -> AppearanceStage:
+        config = settings(steps=steps, style=True, style_samples=64)
+        config = config.model_copy(update={"output": config.output.model_copy(update={"checkpoint_every": 3})})
+        return AppearanceStage(scene, config, {"part": lump}, AskForColour(RED), lambda line: None)
+
+    whole = fresh()
+    run_stage(whole, tmp_path / "whole", quiet=True, say=lambda line: None)
+    half = fresh()
+    half.steps = 3
+    run_stage(half, tmp_path / "half", quiet=True, say=lambda line: None)
+    rest = fresh()
+    run_stage(rest, tmp_path / "half", resume=True, quiet=True, say=lambda line: None)
+    for name, value in whole.field.state_dict().items():
+        assert torch.allclose(value, rest.field.state_dict()[name], atol=1e-6), name
+    rows = read_metrics(tmp_path / "half" / "metrics.jsonl")
+    assert [row["step"] for row in rows] == list(range(1, 7)) and rows[0]["stage"] == "appearance"
+
+
+def test_views_that_do_not_fill_the_mosaic_are_refused(scene: EditScene, lump: SimpleNamespace) -> None:
+    guidance = AskForColour(RED)
+    guidance.view_grid = 2
+    with pytest.raises(UserError, match="appearance.views = 2"):
+        AppearanceStage(scene, settings(), {"part": lump}, guidance, lambda line: None)

@@ -1,0 +1,73 @@
+"""`fd_mitsuba export` on run folders: finished, interrupted, damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fd_mitsuba.cli import main
+from fd_mitsuba.config import load_config
+from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, list_checkpoints, save_checkpoint
+from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.run_folder import describe_run
+
+Make = Callable[..., Path]
+
+
+@pytest.fixture
+def run_folder(make_scene: Make, tmp_path: Path) -> Path:
+    """A run that was interrupted after its first checkpoint; the part is still the region."""
+    scene = load_edit_scene(make_scene())
+    config = load_config(None, ["geometry.grid_resolution=16", "geometry.lambda_sds=0"])
+    folder = tmp_path / "run"
+    describe_run(scene, config, folder, "fd_mitsuba run scene.xml")
+    stage = GeometryStage(scene, config, None)
+    header = CheckpointHeader(stage.name, 3, config.content_hash(stage.name), counters=dict(stage.counters))
+    save_checkpoint(checkpoint_folder(folder, stage.name), header, stage.field, stage.optimiser, keep=2)
+    return folder
+
+
+def test_interrupted_run_is_exported(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(run_folder), "--texture-size", "64", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert written["base_identical"] and written["part_faces"]["part"] > 100
+    for name in written["files"]:
+        assert (run_folder / "export" / name).is_file()
+    assert (run_folder / "export" / "base" / "animal.ply").is_file()
+
+
+def test_one_format(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(run_folder), "--format", "glb", "ply"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        str(run_folder / "export" / "asset.glb"),
+        str(run_folder / "export" / "ply" / "part_part.ply"),
+    ]
+    assert not (run_folder / "export" / "mitsuba").exists()
+
+
+def test_what_cannot_be_exported_is_one_line(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    def complaint(folder: Path) -> str:
+        assert main(["export", str(folder)]) == 1
+        return capfd.readouterr().err
+
+    assert "no such run folder" in complaint(tmp_path / "nowhere")
+    assert "not a run" in complaint(tmp_path)
+    scene = tmp_path / "scene.xml"
+    text = scene.read_text()
+    scene.write_text(text.replace('value="0.5"', 'value="0.6"'))
+    assert "was changed since the run" in complaint(run_folder)
+    scene.unlink()
+    assert "the run's scene is gone" in complaint(run_folder)
+    scene.write_text(text)
+    settings = run_folder / "config.json"
+    before = settings.read_text()
+    settings.write_text(json.dumps({**json.loads(before), "unknown": 1}))
+    assert "another version" in complaint(run_folder)
+    settings.write_text(before)
+    for path in list_checkpoints(run_folder / "checkpoints"):
+        path.unlink()
+    assert "no checkpoint; run the geometry stage first" in complaint(run_folder)

@@ -1,0 +1,136 @@
+"""Both stages through the command line: outputs, resuming, another material for a finished shape, relighting."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from conftest import BASE, INTEGRATOR, PART, REGION, write_ply
+from PIL import Image
+from tiny_pipelines import save_pipeline
+
+from fd_mitsuba.cli import main
+from fd_mitsuba.training.checkpoint import list_checkpoints
+from fd_mitsuba.training.record import read_metrics
+
+SETTINGS = """
+[field]
+levels = 2
+log2_table = 8
+base_resolution = 4
+finest_resolution = 16
+[geometry]
+steps = 2
+grid_resolution = 16
+focal_samples = 256
+views = 2
+spp = 1
+[texture]
+levels = 2
+log2_table = 8
+[appearance]
+steps = 3
+views = 2
+spp = 2
+picture_size = 16
+style = true
+style_samples = 32
+boundary_reach = 0.1
+[output]
+sheet_every = 2
+checkpoint_every = 2
+turntable_frames = 2
+turntable_size = 32
+texture_size = 32
+"""
+LIGHT = """<default name="level" value="1.0"/>
+  <emitter type="constant" id="light"><rgb name="radiance" value="$level"/></emitter>"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
+    root = tmp_path_factory.mktemp("whole")
+    write_ply(root / "animal.ply", *animal)
+    pieces = ['<scene version="3.0.0">', LIGHT, INTEGRATOR, BASE, PART, REGION, "</scene>"]
+    (root / "scene.xml").write_text("\n".join(pieces))
+    (root / "tiny.toml").write_text(SETTINGS)
+    save_pipeline("sd15", root / "sd15")
+    return root
+
+
+def run(place: Path, output: str, *more: str) -> int:
+    words = ["run", place / "scene.xml", "-c", place / "tiny.toml", "--set", f"guidance.model={place / 'sd15'}"]
+    return main([str(word) for word in (*words, "-o", place / output, "-q", "-t", "2", *more)])
+
+
+@pytest.fixture(scope="module")
+def finished(place: Path) -> Path:
+    assert run(place, "run") == 0
+    return place / "run"
+
+
+def test_pictures_and_assets_are_there(finished: Path) -> None:
+    frames = imageio.imread(finished / "videos" / "appearance.mp4")
+    assert frames.shape[1:] == (32, 32, 3)
+    with Image.open(finished / "images" / "appearance.png") as sheet:
+        assert np.asarray(sheet).std() > 10
+    names = {path.name for path in (finished / "export").rglob("*") if path.is_file()}
+    assert {"asset.glb", "scene.xml", "part_part.ply", "part_part_base_color.png", "animal.ply"} <= names
+
+
+def test_metrics_of_both_stages(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["base_identical"] is True and metrics["appearance"]["base_psnr_db"] >= 60
+    assert metrics["appearance"]["mask_error"] == 0
+    rows = read_metrics(finished / "metrics.jsonl")
+    assert [row["step"] for row in rows if row["stage"] == "appearance"] == [1, 2, 3]
+    assert {"loss_sds", "loss_style_gradient", "loss_style_boundary"} <= set(rows[-1])
+
+
+def test_a_finished_shape_takes_another_material(place: Path, finished: Path) -> None:
+    assert run(place, "again", "--from", str(finished), "--prompt", "a pig with golden wings") == 0
+    again = place / "again"
+    same = "export/part_part.ply"
+    assert (again / same).read_bytes() == (finished / same).read_bytes()
+    assert json.loads((again / "metrics.json").read_text())["prompt"] == "a pig with golden wings"
+    stages = {row["stage"] for row in read_metrics(again / "metrics.jsonl")}
+    assert stages == {"appearance"}
+
+
+def test_shape_first_and_material_later(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "parts", "--stage", "geometry") == 0
+    assert not (place / "parts" / "images" / "appearance.png").exists()
+    assert main(["render", str(place / "parts")]) == 1
+    assert "appearance stage has not begun" in capfd.readouterr().err
+    assert run(place, "parts", "--stage", "appearance") == 0
+    assert len(list_checkpoints(place / "parts" / "checkpoints_appearance")) == 2
+
+
+def test_another_light(place: Path, finished: Path) -> None:
+    pictures = {}
+    for level in ("1.0", "0.1"):
+        words = ["render", str(finished), "-D", f"level={level}", "--views", "1", "--size", "24", "--spp", "8"]
+        assert main([*words, "-o", f"at_{level}"]) == 0
+        with Image.open(finished / "renders" / f"at_{level}_00.png") as picture:
+            pictures[level] = np.asarray(picture).astype(float)
+    # The exposure follows the light, so a uniform light of another level gives the same picture.
+    assert np.abs(pictures["1.0"] - pictures["0.1"]).mean() < 1.5
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--stage", "appearance"), "no checkpoint; run the geometry stage first"),
+        (("--from", "nowhere"), "no checkpoint; run the geometry stage first"),
+    ],
+)
+def test_without_a_finished_shape(
+    place: Path, words: tuple[str, ...], expected: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run(place, "nothing", *words) == 1
+    error = capfd.readouterr().err
+    assert expected in error and "Traceback" not in error
+    assert not (place / "nothing").exists()
