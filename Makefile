@@ -4,7 +4,7 @@
 #   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
-SCENE ?= scenes/pegasus/scene.xml
+SCENE ?= scenes/cat/scene.xml
 CONFIG ?= configs/quick.toml
 OUT ?= runs/demo
 TORCH ?= torch==2.13.0

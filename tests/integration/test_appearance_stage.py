@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from conftest import BASE
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
@@ -139,3 +140,15 @@ def test_views_that_do_not_fill_the_mosaic_are_refused(scene: EditScene, lump: S
     guidance.view_grid = 2
     with pytest.raises(UserError, match="appearance.views = 2"):
         AppearanceStage(scene, settings(), {"part": lump}, guidance, lambda line: None)
+
+
+def test_exposure_follows_the_light_and_not_the_base(make_scene: Callable[..., Path], lump: SimpleNamespace) -> None:
+    """Under a uniform light of radiance L, clay (base colour 0.5 and its gloss) sends about 0.6 L."""
+    found = []
+    for level, grey in ((1.0, 0.5), (4.0, 0.5), (1.0, 0.05)):
+        light = f'<emitter type="constant"><rgb name="radiance" value="{level}"/></emitter>'
+        bsdf = f'<bsdf type="diffuse"><rgb name="reflectance" value="{grey}"/></bsdf>'
+        edited = load_edit_scene(make_scene(light=light, base=BASE.replace('<bsdf type="diffuse"/>', bsdf)))
+        found.append(AppearanceStage(edited, settings(exposure=None), {"part": lump}, None, lambda line: None).exposure)
+    assert found[0] == pytest.approx(1.0, rel=0.1)
+    assert found[1] == pytest.approx(found[0] / 4, rel=0.02) and found[2] == pytest.approx(found[0], rel=1e-3)

@@ -174,15 +174,25 @@ def test_metrics_of_the_run(finished: Path) -> None:
     assert metrics["part_faces"]["part"] > 20 and metrics["prompt"] == "a pig with two wings"
 
 
-def test_overlap_is_that_of_the_exported_files(finished: Path) -> None:
-    metrics = json.loads((finished / "metrics.json").read_text())
-    part = trimesh.load(finished / "export" / "part_part.ply")
+def test_overlap_is_that_of_the_part_as_it_grew(finished: Path, place: Path) -> None:
+    """The exported solid reaches into the base on purpose, so it overlaps more."""
+    config = load_config(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
+    scene = load_edit_scene(place / "scene.xml")
+    stage = load_finished_stage(scene, config, finished)
+    vertices, faces = (tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
+    exported = trimesh.load(finished / "export" / "part_part.ply")
     base = trimesh.load(finished / "export" / "base" / "animal.ply")
-    low, high = part.bounds
-    points = np.random.default_rng(0).uniform(low, high, (40000, 3))
-    points = points[MeshDistance(part.vertices, part.faces).inside(points)]
-    overlap = MeshDistance(base.vertices, base.faces).inside(points).mean()
-    assert metrics["overlap_fraction"] == pytest.approx(overlap, abs=0.02)
+
+    def overlap(part_vertices: np.ndarray, part_faces: np.ndarray) -> float:
+        low, high = part_vertices.min(axis=0), part_vertices.max(axis=0)
+        points = np.random.default_rng(0).uniform(low, high, (40000, 3))
+        points = points[MeshDistance(part_vertices, part_faces).inside(points)]
+        return float(MeshDistance(base.vertices, base.faces).inside(points).mean())
+
+    metrics = json.loads((finished / "metrics.json").read_text())
+    grown = overlap(scene.frame.to_user(vertices), faces)
+    assert metrics["overlap_fraction"] == pytest.approx(grown, abs=0.02)
+    assert overlap(exported.vertices, exported.faces) > grown
 
 
 def test_rows_of_both_phases(finished: Path) -> None:

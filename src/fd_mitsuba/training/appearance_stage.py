@@ -33,7 +33,7 @@ from fd_mitsuba.training.surface_points import Triangles, points_on
 
 _POOL = 32768
 """Points on the parts' surface that the style losses choose from."""
-_CLAY_LEVEL = 0.45
+_CLAY_LEVEL = 0.6
 """Linear luminance that the exposure gives to the brightest part of the base in clay, whose base colour is 0.5."""
 _INITIAL_STEPS = 300
 """Steps in which the single path's field learns the base's own material before the guidance starts."""
@@ -246,7 +246,7 @@ class AppearanceStage:
         seed = seed_for(self.config.seed, Purpose.EXPOSURE)
         whole = AppearancePass(self.scene, {}, self.shading, 64, 16, deferred_base=True)
         gbuffer = whole.trace(cameras, seed)
-        return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.part_mask, _CLAY_LEVEL)
+        return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.alpha, _CLAY_LEVEL)
 
     def _check_gradients(self, step: int) -> None:
         for parameter in self.field.parameters():
