@@ -107,6 +107,7 @@ def stock(
     spp: int,
     max_depth: int = 2,
     seed: int = 11,
+    hide_emitters: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """RGB (S, S, 3), multiplied by coverage, and alpha (S, S) of the first view, by Mitsuba's `path`."""  # fmt: skip
     loaded = scene.mitsuba_scene(without=("focal_region", "sensor", "integrator"))
@@ -136,7 +137,7 @@ def stock(
             "sampler": {"type": "independent"},
         }
     )  # fmt: skip
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": hide_emitters})
     whole = mi.load_dict({"type": "scene", **content}, optimize=False, parallel=False)
     pixels = np.array(mi.render(whole, sensor=sensor, integrator=integrator, spp=spp, seed=seed))
     return pixels[..., :3], pixels[..., 3]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,23 @@ def mi() -> Any:
     from fd_mitsuba.scene.scene_file import ready_mitsuba
 
     return ready_mitsuba()
+
+
+@pytest.fixture
+def one_thread(mi: Any) -> Iterator[None]:
+    """Sums are added up in one order, so that the same seed gives the same bytes.
+
+    More threads round differently, and Adam makes whole steps of gradients that are nothing but rounding.
+    """
+    import drjit as dr
+    import torch
+
+    before = dr.thread_count(), torch.get_num_threads()
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)
+    yield
+    dr.set_thread_count(before[0])
+    torch.set_num_threads(before[1])
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -13,20 +12,21 @@ from PIL import Image
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.evaluation.lit_views import lit_ring, render_field, ring_cameras
+from fd_mitsuba.evaluation.lit_views import lit_ring, ring_cameras
 from fd_mitsuba.evaluation.preservation import measure_preservation
 from fd_mitsuba.evaluation.turntable import write_sheet, write_video
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import shape_triangles
 from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.appearance_stage import AppearanceStage
-from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_newest
-from fd_mitsuba.training.loop import run_stage
+from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
 from fd_mitsuba.training.record import write_picture
 from fd_mitsuba.training.saved_run import saved_run
 from fd_mitsuba.training.sheets import map_rows
@@ -51,40 +51,24 @@ def parts_of_run(scene: EditScene, folder: Path) -> dict[str, TriangleMesh]:
     return parts
 
 
-def prepare_appearance(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -> DiffusionGuidance | None:
+def prepare_appearance(
+    scene: EditScene, config: RunConfig, say: Callable[[str], None], say_of_prompt: Callable[[str], None]
+) -> DiffusionGuidance | None:
     """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
 
+    Args:
+        say: takes remarks about the scene, `say_of_prompt` those about the prompt's words.
+
     Raises:
-        UserError: see `check_appearance_inputs` and `DiffusionGuidance.load`.
+        UserError: see `check_appearance_inputs`, `DiffusionGuidance.load` and `take_prompt`.
     """
     for warning in check_appearance_inputs(scene):
         say(warning)
     if config.appearance.lambda_sds == 0:
         return None
     guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
-    guidance.set_prompt(scene.prompt, scene.negative_prompt)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt)
     return guidance
-
-
-def run_appearance(
-    scene: EditScene,
-    config: RunConfig,
-    folder: Path,
-    guidance: DiffusionGuidance | None,
-    resume: bool = False,
-    quiet: bool = False,
-    say: Callable[[str], None] = print,
-) -> dict:
-    """Learn the parts' materials and write their pictures; returns the figures for `metrics.json`.
-
-    Raises:
-        UserError, RunStopped, Interrupted: see `training.loop.run_stage`.
-    """
-    started = time.monotonic()
-    stage = AppearanceStage(scene, config, parts_of_run(scene, folder), guidance, say)
-    run_stage(stage, folder, resume, quiet, say)
-    figures = write_appearance(stage, folder)
-    return {**figures, "seconds": round(time.monotonic() - started, 1)}
 
 
 def finished_appearance(
@@ -98,57 +82,50 @@ def finished_appearance(
     Raises:
         UserError: parts are missing, or every checkpoint is damaged.
     """
-    checkpoints = checkpoint_folder(folder, AppearanceStage.name)
-    if not list_checkpoints(checkpoints):
+    if not list_checkpoints(checkpoint_folder(folder, AppearanceStage.name)):
         return None
     config_hash = config.content_hash(AppearanceStage.name)
     if max_depth is not None:
         config = config.model_copy(update={"appearance": config.appearance.model_copy(update={"max_depth": max_depth})})
     stage = AppearanceStage(scene, config, parts_of_run(scene, folder), None, lambda line: None)
-    done, _ = load_newest(checkpoints, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
-    if not done:
-        raise UserError(f"{checkpoints}: every checkpoint is damaged; run the appearance stage again")
+    load_trained(folder, stage, config_hash)
     return stage
 
 
 def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
     """Write the lit turntable, before and after, and the maps; returns the measured figures."""
     output, rendering = stage.config.output, stage.rendering
-    alone = base_alone(stage)
-    video = lit_turntable(stage, stage.rendering, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
+    alone = AppearancePass(stage.scene, {}, stage.shading, rendering.size, rendering.spp)
+    video = lit_turntable(stage, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
     write_video(video, folder / "videos" / "appearance.mp4")
     cameras, size = ring_cameras(_SHEET_VIEWS, stage.aim), min(output.turntable_size, 192)
-    bends = "normal" in stage.material.learned
     rows = {
-        "base": lit_ring(alone, None, False, cameras, stage.exposure, size, _SHEET_SPP),
-        f"result: {stage.scene.prompt}": lit_ring(
-            rendering, stage.field, bends, cameras, stage.exposure, size, _SHEET_SPP
-        ),
+        "base": lit_ring(alone, alone.render_base, cameras, stage.exposure, size, _SHEET_SPP),
+        f"result: {stage.scene.prompt}": lit_turntable(stage, _SHEET_VIEWS, size, _SHEET_SPP),
     }
     with torch.no_grad():
         gbuffer = rendering.trace(cameras, 0, size=size, spp=_VIDEO_SPP)
-        pictures, texture = render_field(rendering, stage.field, bends, gbuffer, 0)
+        texture = stage.texture(gbuffer)
+        pictures = stage.render(gbuffer, texture, 0)
     maps = map_rows(gbuffer, pictures, texture, stage.exposure)
     del maps["merged"]  # at few samples; the result's own row has more
     write_sheet({**rows, **maps}, folder / "images" / "appearance.png")
-    kept = measure_preservation(rendering, alone, ring_cameras(_SHEET_VIEWS, stage.aim), stage.exposure, 128, 16)
+    kept = measure_preservation(rendering, alone, cameras, stage.exposure, 128, 16)
     return {
         **asdict(kept),
         "exposure": stage.exposure,
         "learned": list(stage.material.learned),
-        **{name: float(value) for name, value in stage.check_field(stage.steps).items()},
+        **stage.check_field(stage.steps),
     }
 
 
-def base_alone(stage: AppearanceStage) -> AppearancePass:
-    """A pass of the same scene and light without any part."""
-    return AppearancePass(stage.scene, {}, stage.shading, stage.rendering.size, stage.rendering.spp)
-
-
-def lit_turntable(stage: AppearanceStage, rendering: AppearancePass, count: int, size: int, spp: int) -> np.ndarray:
+def lit_turntable(stage: AppearanceStage, count: int, size: int, spp: int) -> np.ndarray:
     """Frames (count, size, size, 3) uint8 of the finished object, front first."""
-    bends = "normal" in stage.material.learned
-    return lit_ring(rendering, stage.field, bends, ring_cameras(count, stage.aim), stage.exposure, size, spp)
+
+    def shade(gbuffer: GBuffer, seed: int) -> torch.Tensor:
+        return stage.render(gbuffer, stage.texture(gbuffer), seed).merged
+
+    return lit_ring(stage.rendering, shade, ring_cameras(count, stage.aim), stage.exposure, size, spp)
 
 
 def render_run(
@@ -171,7 +148,7 @@ def render_run(
     if stage is None:
         raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")
     stage.set_bounces()
-    frames = lit_turntable(stage, stage.rendering, views, size, spp)
+    frames = lit_turntable(stage, views, size, spp)
     paths = [folder / "renders" / f"{name}.png"]
     write_sheet({scene.prompt: frames}, paths[0])
     for number, frame in enumerate(frames):

@@ -8,10 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from fd_mitsuba import __version__
-from fd_mitsuba.appearance import finished_appearance, prepare_appearance, run_appearance
+from fd_mitsuba.appearance import finished_appearance, parts_of_run, prepare_appearance, write_appearance
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.locality import measure_locality
@@ -22,11 +23,13 @@ from fd_mitsuba.export.meshes import copy_base, write_mesh
 from fd_mitsuba.export.part_record import part_file, part_record
 from fd_mitsuba.export.part_solid import part_solid
 from fd_mitsuba.export.solid import LEAST_FACES, Solid
+from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.guidance.vocabulary import read_prompt
+from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.scene_file import SceneFile
-from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_newest, write_atomically
+from fd_mitsuba.training.appearance_stage import AppearanceStage
+from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained, write_atomically
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.run_folder import check_folder, describe_run, discarded_without_checkpoint, write_json
@@ -72,29 +75,50 @@ def run(
     check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
     # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
     guidance = _guidance(scene, config, say) if with_geometry else None
-    for_appearance = prepare_appearance(scene, config, say) if "appearance" in stages else None
+    # Both priors know the same words: what the geometry stage has said of them is not said again.
+    listener = (lambda line: None) if guidance is not None else say
+    for_appearance = prepare_appearance(scene, config, say, listener) if "appearance" in stages else None
     if with_geometry:
-        stage = GeometryStage(scene, config, guidance)
+        geometry = GeometryStage(scene, config, guidance)
         with discarded_without_checkpoint(folder):
             describe_run(scene, config, folder, command)
-            run_stage(stage, folder, resume, quiet, say)
+            run_stage(geometry, folder, resume, quiet, say)
     elif geometry_from is not None:
-        stage = load_finished_stage(scene, config, geometry_from)
+        refuse_other_shape(saved_run(geometry_from)[0], scene, geometry_from)
+        geometry = load_finished_stage(scene, config, geometry_from)
         describe_run(scene, config, folder, command)
         take_geometry(geometry_from, folder)
     else:
-        stage = load_finished_stage(scene, config, folder)
-    metrics = export_geometry(stage, folder)
-    metrics["seconds"] = round(time.monotonic() - started, 1)
-    write_json(folder / "metrics.json", metrics)
-    if "appearance" in stages:
-        figures = run_appearance(scene, config, folder, for_appearance, resume, quiet, say)
-        metrics["appearance"] = figures
+        geometry = load_finished_stage(scene, config, folder)
+    metrics = export_geometry(geometry, folder)
+
+    def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)
         write_json(folder / "metrics.json", metrics)
+
+    write_metrics()
+    field = None
+    if "appearance" in stages:
+        appearance = AppearanceStage(scene, config, parts_of_run(scene, folder), for_appearance, say)
+        run_stage(appearance, folder, resume, quiet, say)
+        field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
+        write_metrics()
     if with_assets:
-        export_run(folder, ("glb", "mitsuba"), config.output.texture_size, say)
+        write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
     return metrics
+
+
+def refuse_other_shape(before: EditScene, now: EditScene, source: Path) -> None:
+    """UserError if a run's scene has another base or other focal regions; light, materials and prompt may differ."""
+    same_base = all(
+        np.array_equal(getattr(before.base_soup, name), getattr(now.base_soup, name)) for name in ("vertices", "faces")
+    )
+
+    def places(scene: EditScene) -> list[tuple]:
+        return [(region.name, region.part, region.mode, region.to_canonical.tobytes()) for region in scene.regions]
+
+    if not same_base or places(before) != places(now):
+        raise UserError(f"{source}: its base or its focal regions are others than those of {now.path}; run anew")
 
 
 def take_geometry(source: Path, folder: Path) -> None:
@@ -106,13 +130,8 @@ def take_geometry(source: Path, folder: Path) -> None:
 def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> GeometryStage:
     """The geometry stage of a run folder at its newest checkpoint, without guidance; UserError if there is none."""
     stage = GeometryStage(scene, config, None)
-    checkpoints = checkpoint_folder(folder, stage.name)
-    if not list_checkpoints(checkpoints):
-        raise UserError(f"{checkpoints}: no checkpoint; run the geometry stage first")
-    config_hash = config.content_hash(stage.name)
-    done, _ = load_newest(checkpoints, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
-    if not done:
-        raise UserError(f"{checkpoints}: every checkpoint is damaged; run the geometry stage again")
+    if not load_trained(folder, stage, config.content_hash(stage.name)):
+        raise UserError(f"{checkpoint_folder(folder, stage.name)}: no checkpoint; run the geometry stage first")
     return stage
 
 
@@ -174,23 +193,41 @@ def export_run(
     Raises:
         UserError: no run or no checkpoint there, and see `export.assets.export_assets`.
     """
-    scene, config = saved_run(folder)
-    stage = load_finished_stage(scene, config, folder)
     if faces is not None and faces < LEAST_FACES:
         raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
-    solids = {name: part_solid(stage, name) for name in scene.parts}
+    scene, config = saved_run(folder)
+    geometry = load_finished_stage(scene, config, folder)
+    appearance = finished_appearance(scene, config, folder)
+    field = None if appearance is None else appearance.field
+    return write_assets(geometry, field, folder, formats, texture_size, say, faces)
+
+
+def write_assets(
+    geometry: GeometryStage,
+    field: TextureField | None,
+    folder: Path,
+    formats: Collection[str],
+    texture_size: int,
+    say: Callable[[str], None],
+    faces: int | None = None,
+) -> dict[str, Any]:
+    """Write the assets of the stages' present state below `folder`; returns what `export.assets` says of them.
+
+    Args:
+        field: the parts' learned material; None: the constants of the scene's part BSDF.
+        faces: at most so many triangles a part; None: all.
+    """
+    scene = geometry.scene
+    solids = {name: part_solid(geometry, name) for name in scene.parts}
     if faces is not None:
         solids = {name: solid.decimated(faces) for name, solid in solids.items()}
     cut = _cut(scene, solids) if scene.subtracts else None
     if cut is not None:
         solids = _removed(scene, cut)
-    appearance = finished_appearance(scene, config, folder)
-    values = None if appearance is None else appearance.field
-    parts = {
-        name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, values) for name, solid in solids.items()
-    }
+    parts = {name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field) for name, solid in solids.items()}
     write_json(folder / "export" / "part.json", part_record(scene, solids))
-    return export_assets(scene, config, parts, folder / "export", formats, texture_size, say, cut, faces)
+    export = folder / "export"
+    return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
 
 
 def _cut(scene: EditScene, solids: dict[str, Solid]) -> CutBase:
@@ -225,26 +262,10 @@ def _guidance(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -
     if config.geometry.lambda_sds == 0:
         return None
     guidance = DiffusionGuidance.load(config.guidance)
-    unknown = guidance.set_prompt(scene.prompt, scene.negative_prompt)
-    vocabulary = guidance.conventions.vocabulary
-    if vocabulary is not None and scene.subtracts:
+    if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(
             f"{scene.path}: its regions subtract, and the built-in prior knows only parts that are added; set "
             "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
         )
-    if vocabulary is not None:
-        reading = read_prompt(scene.prompt, vocabulary)
-        if not reading.parts:
-            hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
-            raise UserError(
-                f"prompt {scene.prompt!r}: the built-in prior knows no such part; nearest: {hint}; reword it "
-                "(`fd_mitsuba prior` lists the words), or set guidance.model to a Stable Diffusion folder or hub id"
-            )
-        unknown = list(reading.ignored)
-    if unknown:
-        verb = "is" if len(unknown) == 1 else "are"
-        say(
-            f"the prompt's {', '.join(map(repr, unknown))} {verb} outside the built-in prior's vocabulary and will not "
-            "steer the result; `fd_mitsuba prior` lists the words it knows"
-        )
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say)
     return guidance

@@ -100,6 +100,27 @@ def test_a_finished_shape_takes_another_material(place: Path, finished: Path) ->
     assert stages == {"appearance"}
 
 
+def test_a_finished_shape_is_not_taken_for_other_regions(
+    place: Path, finished: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    moved = (place / "scene.xml").read_text().replace('y="0.35"', 'y="0.36"')
+    (place / "moved.xml").write_text(moved)
+    words = ["run", str(place / "moved.xml"), "-c", str(place / "tiny.toml"), "-o", str(place / "moved"), "-q"]
+    assert main([*words, "--set", f"guidance.model={place / 'sd15'}", "--from", str(finished)]) == 1
+    error = capfd.readouterr().err
+    assert "focal regions are others" in error and "Traceback" not in error
+    assert not (place / "moved").exists()
+
+
+def test_a_material_prompt_without_a_known_part_is_refused(
+    place: Path, finished: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--from", str(finished), "--prompt", "a pig with a spoon", "--set", "guidance.model=builtin"]
+    assert run(place, "spoon", *words) == 1
+    error = capfd.readouterr().err
+    assert "knows no such part" in error and "Traceback" not in error
+
+
 def test_shape_first_and_material_later(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run(place, "parts", "--stage", "geometry") == 0
     assert not (place / "parts" / "images" / "appearance.png").exists()
@@ -124,7 +145,7 @@ def test_another_light(place: Path, finished: Path) -> None:
     ("words", "expected"),
     [
         (("--stage", "appearance"), "no checkpoint; run the geometry stage first"),
-        (("--from", "nowhere"), "no checkpoint; run the geometry stage first"),
+        (("--from", "nowhere"), "no such run folder"),
     ],
 )
 def test_without_a_finished_shape(

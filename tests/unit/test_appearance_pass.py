@@ -83,6 +83,19 @@ def test_bounces_are_those_of_stock_mitsuba(lamp: EditScene, depth: int) -> None
     assert_as_stock(lamp, "diffuse", depth)
 
 
+def test_the_light_behind_the_object_is_what_stock_mitsuba_shows(sky: EditScene, lamp: EditScene) -> None:
+    high = camera(elevation=-20.0, fov=60.0)
+    appearance = AppearancePass(sky, {"part": ball()}, shading("diffuse"), 24, 256)
+    gbuffer = appearance.trace(high, 3)
+    behind = appearance.render_light(gbuffer)[0].permute(1, 2, 0).numpy()
+    expected, _ = stock(sky, ball(), GREY, high, 24, 256, hide_emitters=False)
+    empty = gbuffer.alpha[0, 0].numpy() == 0
+    assert empty.mean() > 0.3 and expected[empty].std() > 0.05
+    assert np.abs(behind[empty] - expected[empty]).mean() < 0.01 * expected[empty].mean()
+    lit_by_lamp = AppearancePass(lamp, {"part": ball()}, shading("diffuse"), 8, 2)
+    assert not lit_by_lamp.render_light(lit_by_lamp.trace(high, 3)).any()
+
+
 def test_a_white_part_in_a_white_furnace_gains_no_energy(tmp_path: Path) -> None:
     """Alone in light of radiance 1 from everywhere, no BSDF should send back more than 1.
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
+from torch import Tensor
 
-from fd_mitsuba.fields.texture import TextureField, TextureValues
-from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
+from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.tonemap import to_srgb
 from fd_mitsuba.scene.views import CameraBatch
@@ -30,8 +32,7 @@ def some_cameras(cameras: CameraBatch, rows: slice) -> CameraBatch:
 @torch.no_grad()
 def lit_ring(
     rendering: AppearancePass,
-    field: TextureField | None,
-    bends: bool,
+    shade: Callable[[GBuffer, int], Tensor],
     cameras: CameraBatch,
     exposure: float,
     size: int,
@@ -41,27 +42,12 @@ def lit_ring(
     """sRGB pictures (B, size, size, 3) uint8 over grey.
 
     Args:
-        field: None renders the base path alone: `rendering` may then have no parts.
-        bends: whether the field's normal is used.
+        shade: a G-buffer and a seed -> linear pictures (b, 3, size, size), multiplied by coverage.
     """
     frames = []
     for start in range(0, len(cameras), _VIEWS_AT_ONCE):
         few = some_cameras(cameras, slice(start, start + _VIEWS_AT_ONCE))
         gbuffer = rendering.trace(few, seed + start, size=size, spp=spp)
-        if field is None:
-            linear = rendering.render_base(gbuffer, seed + start)
-        else:
-            linear = render_field(rendering, field, bends, gbuffer, seed + start)[0].merged
-        finished = to_srgb(linear * exposure + _BACKGROUND * (1 - gbuffer.alpha))
-        frames.append(as_bytes(finished))
+        linear = shade(gbuffer, seed + start)
+        frames.append(as_bytes(to_srgb(linear * exposure + _BACKGROUND * (1 - gbuffer.alpha))))
     return np.concatenate(frames)
-
-
-def render_field(
-    rendering: AppearancePass, field: TextureField, bends: bool, gbuffer: GBuffer, seed: int
-) -> tuple[AppearancePictures, TextureValues]:
-    """Pictures of a traced batch with the field's material, and the material at the G-buffer's points."""
-    texture = field(gbuffer.points)
-    normal = texture.normal if bends else None
-    pictures = rendering.render(gbuffer, texture.base_color, texture.roughness, texture.metallic, normal, seed=seed)
-    return pictures, texture

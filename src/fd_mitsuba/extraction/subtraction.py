@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from torch import Tensor
 
@@ -27,17 +28,8 @@ class SubtractionExtractor(SurfaceExtractor):
         Others: see `SurfaceExtractor`.
     """
 
-    def __init__(
-        self,
-        grid: TetGrid,
-        sdf_base: Tensor,
-        initial_sdf: Tensor,
-        active_index: Tensor,
-        union_k: float = 0.15,
-        union_only_outside: bool = False,
-        seam_width: float | None = None,
-    ) -> None:
-        super().__init__(grid, -sdf_base, initial_sdf, active_index, union_k, union_only_outside, seam_width)
+    def __init__(self, grid: TetGrid, sdf_base: Tensor, *others: Any, **named: Any) -> None:
+        super().__init__(grid, -sdf_base, *others, **named)
 
     def __call__(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
         """The remaining base's surface, counter-clockwise seen from outside; see `SurfaceExtractor.__call__`."""

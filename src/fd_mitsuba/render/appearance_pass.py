@@ -19,7 +19,7 @@ import torch
 from fd_mitsuba.render import bridge
 from fd_mitsuba.render.appearance_scene import AppearanceScene, Triangles
 from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.gbuffer import GBuffer, trace
+from fd_mitsuba.render.gbuffer import GBuffer, Samples, trace
 from fd_mitsuba.render.light_transport import Incident, LightTransport
 from fd_mitsuba.render.part_shading import CHANNELS, FilmShading, PartShading
 from fd_mitsuba.render.shading_frame import bent_frame
@@ -144,7 +144,7 @@ class AppearancePass:
         """The base path alone: (B, 3, S, S), constant."""
         samples = gbuffer.base_samples
         if not len(samples):
-            return torch.zeros(gbuffer.views.count, 3, gbuffer.views.size, gbuffer.views.size)
+            return _black(gbuffer)
         with dr.suspend_grad():
             ray = gbuffer.rays(samples)
             surface = samples.hit.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -160,7 +160,7 @@ class AppearancePass:
         """The part path with the parts in plain grey clay: (B, 3, S, S), constant."""
         samples = gbuffer.part_samples
         if not len(samples):
-            return torch.zeros(gbuffer.views.count, 3, gbuffer.views.size, gbuffer.views.size)
+            return _black(gbuffer)
         if self._clay is None:
             self._clay = PartShading(CLAY).load({})
         with dr.suspend_grad():
@@ -168,6 +168,18 @@ class AppearancePass:
             numbers = gbuffer.numbers(samples, seed)
             light = self._transport.incident(surface, self._clay, numbers, samples.lane, mi.Bool(True))
             flat = bridge.to_torch(dr.concat(gbuffer.picture(samples, _reflected(self._clay, surface, light))))
+        return _as_picture(flat, gbuffer)
+
+    def render_light(self, gbuffer: GBuffer) -> torch.Tensor:
+        """The environment as the cameras see it behind everything: (B, 3, S, S), constant; black if there is none."""
+        environment = self.scene.lit.environment()
+        if environment is None:
+            return _black(gbuffer)
+        with dr.suspend_grad():
+            every = Samples(dr.arange(mi.UInt32, gbuffer.pixels * gbuffer.spp), dr.zeros(mi.PreliminaryIntersection3f))
+            away = dr.zeros(mi.SurfaceInteraction3f, len(every))
+            away.wi = -gbuffer.rays(every).d
+            flat = bridge.to_torch(dr.concat(gbuffer.picture(every, mi.Color3f(environment.eval(away)))))
         return _as_picture(flat, gbuffer)
 
     def _films(
@@ -197,7 +209,7 @@ class AppearancePass:
         samples = gbuffer.part_samples
         if not len(samples):
             zero = sum((film.sum() * 0.0 for film in films.values()), torch.zeros(()))
-            return zero + torch.zeros(gbuffer.views.count, 3, gbuffer.views.size, gbuffer.views.size)
+            return zero + _black(gbuffer)
         names = list(films)
 
         def draw(*arrays: mi.Float) -> mi.Float:
@@ -226,6 +238,10 @@ class AppearancePass:
         row, column = pixel // size, pixel % size
         surface.uv = mi.Point2f((column + 0.5) / size, (row + 0.5) / (gbuffer.views.count * size))
         return surface
+
+
+def _black(gbuffer: GBuffer) -> torch.Tensor:
+    return torch.zeros(gbuffer.views.count, 3, gbuffer.views.size, gbuffer.views.size)
 
 
 def _as_picture(flat: torch.Tensor, gbuffer: GBuffer) -> torch.Tensor:

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
+from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.part_shading import PartShading
 from fd_mitsuba.render.tonemap import auto_exposure, to_linear, to_srgb
@@ -25,11 +26,13 @@ from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.part_material import part_material
-from fd_mitsuba.scene.views import CameraBatch, sample_views
+from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.sheets import appearance_sheet
+from fd_mitsuba.training.step_views import check_views, step_views
 from fd_mitsuba.training.style_consistency import StyleConsistency, learn_base_material
-from fd_mitsuba.training.surface_points import Triangles, points_on
+from fd_mitsuba.training.surface_points import points_on
 
 _POOL = 32768
 """Points on the parts' surface that the style losses choose from."""
@@ -80,12 +83,7 @@ class AppearanceStage:
         say: Callable[[str], None] = print,
     ) -> None:
         settings = config.appearance
-        mosaic = guidance.view_grid**2 if guidance is not None else 1
-        if settings.views % mosaic:
-            raise UserError(
-                f"appearance.views = {settings.views}: {config.guidance.model} sees {mosaic} views at once; "
-                f"set appearance.views to a multiple of {mosaic}"
-            )
+        check_views(self.name, config, guidance)
         self.scene, self.config, self.parts, self.guidance = scene, config, dict(parts), guidance
         self.steps = settings.steps
         self.counters: dict[str, int] = {}
@@ -93,14 +91,7 @@ class AppearanceStage:
         say(self.material.message)
         seed = seed_for(config.seed, Purpose.TEXTURE)
         self.field = TextureField(config.texture, seed, self.material.start, self.material.learned)
-        self.optimiser = torch.optim.AdamW(
-            self.field.parameters(),
-            lr=settings.learning_rate,
-            betas=settings.betas,
-            eps=settings.eps,
-            weight_decay=settings.weight_decay,
-            fused=True,
-        )
+        self.optimiser = adamw(self.field, settings)
         size = settings.picture_size or (guidance.appearance_size if guidance is not None else 128)
         self.shading = PartShading.of(self.material)
         self.rendering = AppearancePass(
@@ -119,18 +110,9 @@ class AppearanceStage:
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
         """The step's views, and whether they are close-ups of the part."""
-        settings, seed = self.config.cameras, seed_for(self.config.seed, Purpose.APPEARANCE_VIEWS, step)
-        closeup = bool(np.random.default_rng((seed, 1)).random() < settings.focus_fraction)
-        together = self.guidance.view_grid**2 if self.guidance is not None else 1
-        views = sample_views(
-            settings,
-            self.config.appearance.views,
-            seed,
-            focus=self.focus if closeup else None,
-            centre=self.aim if settings.aim == "object" else None,
-            together=together,
-        )
-        return views, closeup
+        seed = seed_for(self.config.seed, Purpose.APPEARANCE_VIEWS, step)
+        count = self.config.appearance.views
+        return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
 
     def texture(self, gbuffer: GBuffer) -> TextureValues:
         """What the field says at the points that are seen, with gradients."""
@@ -159,7 +141,7 @@ class AppearanceStage:
         pictures = self.render(gbuffer, texture, seed)
         if self.guidance is not None and settings.lambda_sds > 0:
             views = AppearanceViews(
-                pictures=self._finished(pictures.merged, pictures.alpha, step),
+                pictures=self._finished(pictures.merged, gbuffer, step),
                 condition=self._condition(gbuffer, pictures, seed, step),
                 mask=gbuffer.alpha,
                 part_mask=gbuffer.part_mask,
@@ -178,16 +160,7 @@ class AppearanceStage:
             "style_gradient": settings.lambda_style,
             "style_boundary": settings.lambda_style * settings.lambda_boundary,
         }
-        total = sum(weights[name] * loss for name, loss in losses.items())
-        values.update({f"loss_{name}": float(loss.detach()) for name, loss in losses.items()})
-        values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
-        if not np.isfinite(values["loss"]):
-            raise RunStopped(f"step {step}: the loss is not finite; lower appearance.learning_rate")
-        if isinstance(total, Tensor) and total.requires_grad:
-            self.optimiser.zero_grad(set_to_none=True)
-            total.backward()
-            self._check_gradients(step)
-            self.optimiser.step()
+        values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
         shown = _detached(pictures), _without_gradient(texture)
         return AppearanceRecord(values, gbuffer, *shown, self.exposure, preview)
 
@@ -209,16 +182,21 @@ class AppearanceStage:
             values = {channel: getattr(texture, channel).numpy() for channel in self.material.feeds}
             self.rendering.set_vertex_values(name, values)
 
-    def _finished(self, linear: Tensor, alpha: Tensor, step: int) -> Tensor:
+    def _finished(self, linear: Tensor, gbuffer: GBuffer, step: int) -> Tensor:
         """sRGB in [0, 1] over the configured background."""
-        return to_srgb(linear * self.exposure + (1 - alpha) * self._background(step, len(linear)))
+        return to_srgb((linear + (1 - gbuffer.alpha) * self._background(gbuffer, step)) * self.exposure)
 
-    def _background(self, step: int, count: int) -> Tensor:
+    def _background(self, gbuffer: GBuffer, step: int) -> Tensor:
+        """Radiance behind the object, such that the exposure makes of it what the setting says."""
         kind = self.config.appearance.background
+        if kind == "light":
+            return self.rendering.render_light(gbuffer)
         if kind == "random":
             generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.BACKGROUND, step))
-            return to_linear(torch.rand(count, 3, 1, 1, generator=generator))
-        return torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
+            colour = to_linear(torch.rand(gbuffer.views.count, 3, 1, 1, generator=generator))
+        else:
+            colour = torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
+        return colour / self.exposure
 
     @torch.no_grad()
     def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:
@@ -226,7 +204,7 @@ class AppearanceStage:
         if not self.guidance.needs_base:
             return None
         clay_part = self.rendering.render_clay(gbuffer, seed)
-        return self._finished(clay_part + pictures.base_path, pictures.alpha, step)
+        return self._finished(clay_part + pictures.base_path, gbuffer, step)
 
     def _style(self, say: Callable[[str], None]) -> StyleConsistency | None:
         settings, seed = self.config.appearance, self.config.seed
@@ -247,11 +225,6 @@ class AppearanceStage:
         whole = AppearancePass(self.scene, {}, self.shading, 64, 16, deferred_base=True)
         gbuffer = whole.trace(cameras, seed)
         return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.alpha, _CLAY_LEVEL)
-
-    def _check_gradients(self, step: int) -> None:
-        for parameter in self.field.parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                raise RunStopped(f"step {step}: a gradient is not finite; lower appearance.learning_rate")
 
 
 def _detached(pictures: AppearancePictures) -> AppearancePictures:

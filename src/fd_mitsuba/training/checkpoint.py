@@ -22,6 +22,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.training.stage import Stage
 
 FORMAT = 1
 _HEADER_KEY = "fd_mitsuba"
@@ -135,6 +136,21 @@ def load_newest(
             counters.update(header.get("counters", {}))
         return int(header["step"]), remarks
     return 0, remarks
+
+
+def load_trained(run: Path, stage: Stage, config_hash: str) -> bool:
+    """Put a stage into the state of its newest whole checkpoint in a run folder; False if it has none at all.
+
+    Raises:
+        UserError: every checkpoint is damaged, and see `load_newest`.
+    """
+    folder = checkpoint_folder(run, stage.name)
+    if not list_checkpoints(folder):
+        return False
+    done, _ = load_newest(folder, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
+    if not done:
+        raise UserError(f"{folder}: every checkpoint is damaged; run the {stage.name} stage again")
+    return True
 
 
 def _digest(tensors: dict[str, Tensor]) -> str:

@@ -26,9 +26,11 @@ from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
-from fd_mitsuba.scene.views import CameraBatch, sample_views
+from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.sheets import geometry_sheet
+from fd_mitsuba.training.step_views import check_views, step_views
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
@@ -74,12 +76,7 @@ class GeometryStage:
                 f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.model} was trained with normals "
                 f"in {trained_in} space; set geometry.normal_space={trained_in}"
             )
-        mosaic = guidance.view_grid**2 if guidance is not None else 1
-        if geometry.views % mosaic:
-            raise UserError(
-                f"geometry.views = {geometry.views}: {config.guidance.model} sees {mosaic} views at once; "
-                f"set geometry.views to a multiple of {mosaic}"
-            )
+        check_views(self.name, config, guidance)
         self.scene, self.config, self.guidance = scene, config, guidance
         self.grid = TetGrid(geometry.grid_resolution)
         points = self.grid.vertices.numpy()
@@ -90,14 +87,7 @@ class GeometryStage:
         self.extractor = self._extractor(self.active)
         self.base_surface = self._base_surface()
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
-        self.optimiser = torch.optim.AdamW(
-            self.field.parameters(),
-            lr=geometry.learning_rate,
-            betas=geometry.betas,
-            eps=geometry.eps,
-            weight_decay=geometry.weight_decay,
-            fused=True,
-        )
+        self.optimiser = adamw(self.field, geometry)
         self.focus = bounding_ball(points[(self.region_sdf > 0).numpy()])
         self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
@@ -133,18 +123,9 @@ class GeometryStage:
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
         """The step's views, and whether they are close-ups of the focal regions."""
-        settings, seed = self.config.cameras, seed_for(self.config.seed, Purpose.VIEWS, step)
-        closeup = bool(np.random.default_rng((seed, 1)).random() < settings.focus_fraction)
-        together = self.guidance.view_grid**2 if self.guidance is not None else 1
-        views = sample_views(
-            settings,
-            self.config.geometry.views,
-            seed,
-            focus=self.focus if closeup else None,
-            centre=self.aim if settings.aim == "object" else None,
-            together=together,
-        )
-        return views, closeup
+        seed = seed_for(self.config.seed, Purpose.VIEWS, step)
+        count = self.config.geometry.views
+        return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
 
     def surface(self) -> UnionSurface:
         """The surface of the base with the part, or without it, for the present parameters; with gradients."""
@@ -180,18 +161,9 @@ class GeometryStage:
             self._watch_visibility(pictures)
         if samples is not None:
             losses.update(self._sample_losses(surface.sample_sdf, samples))
-        total = sum(getattr(geometry, f"lambda_{name}") * loss for name, loss in losses.items())
-        values.update({f"loss_{name}": float(loss.detach()) for name, loss in losses.items()})
-        values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
-        if not np.isfinite(values["loss"]):
-            raise RunStopped(
-                f"step {step}: the loss is not finite; lower geometry.learning_rate or guidance.guidance_scale"
-            )
-        if isinstance(total, Tensor) and total.requires_grad:
-            self.optimiser.zero_grad(set_to_none=True)
-            total.backward()
-            self._check_gradients(step)
-            self.optimiser.step()
+        weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
+        remedy = "lower geometry.learning_rate or guidance.guidance_scale"
+        values.update(descend(self.optimiser, losses, weights, step, remedy))
         values["part_faces"] = float(surface.face_is_part.sum())
         return StepRecord(values, pictures.detach(), preview)
 
@@ -291,8 +263,3 @@ class GeometryStage:
                 f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
                 "or lower geometry.lambda_volume"
             )
-
-    def _check_gradients(self, step: int) -> None:
-        for parameter in self.field.parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                raise RunStopped(f"step {step}: a gradient is not finite; lower geometry.learning_rate")

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-
-class Triangles(Protocol):
-    """A mesh: vertices (V, 3), faces (F, 3)."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
+from fd_mitsuba.render.appearance_scene import Triangles
 
 
 def points_on(meshes: Iterable[Triangles], count: int, seed: int) -> Tensor:

@@ -1,0 +1,54 @@
+"""What every stage does with its losses: add them up, go one step down, and stop where the numbers break."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fd_mitsuba.config_sections import AppearanceConfig, GeometryConfig
+from fd_mitsuba.errors import RunStopped
+
+
+def adamw(field: torch.nn.Module, settings: GeometryConfig | AppearanceConfig) -> torch.optim.AdamW:
+    """The optimiser of a stage's field."""
+    return torch.optim.AdamW(
+        field.parameters(),
+        lr=settings.learning_rate,
+        betas=settings.betas,
+        eps=settings.eps,
+        weight_decay=settings.weight_decay,
+        fused=True,
+    )
+
+
+def descend(
+    optimiser: torch.optim.Optimizer,
+    losses: Mapping[str, Tensor],
+    weights: Mapping[str, float],
+    step: int,
+    remedy: str,
+) -> dict[str, float]:
+    """Change the parameters once along the weighted sum of `losses`; returns every `loss_<name>`, and `loss`.
+
+    Nothing is changed where no loss depends on the parameters.
+
+    Raises:
+        RunStopped: a loss or a gradient is not finite; the message ends with `remedy`.
+    """
+    total = sum(weights[name] * loss for name, loss in losses.items())
+    values = {f"loss_{name}": float(loss.detach()) for name, loss in losses.items()}
+    values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
+    if not np.isfinite(values["loss"]):
+        raise RunStopped(f"step {step}: the loss is not finite; {remedy}")
+    if isinstance(total, Tensor) and total.requires_grad:
+        optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        for group in optimiser.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                    raise RunStopped(f"step {step}: a gradient is not finite; {remedy}")
+        optimiser.step()
+    return values

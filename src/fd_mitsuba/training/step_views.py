@@ -1,0 +1,58 @@
+"""The views of one step of a stage, and whether their number suits the guidance."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from fd_mitsuba.config import CamerasConfig, RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.views import CameraBatch, sample_views
+
+
+class SeesMosaics(Protocol):
+    """A guidance, as far as the choice of views is concerned."""
+
+    view_grid: int
+
+
+def views_at_once(guidance: SeesMosaics | None) -> int:
+    """How many consecutive views make one picture of the guidance."""
+    return 1 if guidance is None else guidance.view_grid**2
+
+
+def check_views(stage: str, config: RunConfig, guidance: SeesMosaics | None) -> None:
+    """UserError where a stage's views do not fill the guidance's mosaics."""
+    views, mosaic = getattr(config, stage).views, views_at_once(guidance)
+    if views % mosaic:
+        raise UserError(
+            f"{stage}.views = {views}: {config.guidance.model} sees {mosaic} views at once; "
+            f"set {stage}.views to a multiple of {mosaic}"
+        )
+
+
+def step_views(
+    settings: CamerasConfig,
+    count: int,
+    seed: int,
+    focus: tuple[np.ndarray, float],
+    aim: np.ndarray,
+    guidance: SeesMosaics | None,
+) -> tuple[CameraBatch, bool]:
+    """`count` views for the seed, and whether they are close-ups.
+
+    Args:
+        focus: centre and radius of what close-ups show, canonical.
+        aim: what the others look at, if `settings.aim` says so.
+    """
+    closeup = bool(np.random.default_rng((seed, 1)).random() < settings.focus_fraction)
+    views = sample_views(
+        settings,
+        count,
+        seed,
+        focus=focus if closeup else None,
+        centre=aim if settings.aim == "object" else None,
+        together=views_at_once(guidance),
+    )
+    return views, closeup
