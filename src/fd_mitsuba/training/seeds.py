@@ -24,6 +24,7 @@ class Purpose(IntEnum):
     STYLE = 11
     EXPOSURE = 12
     BASE_MATERIAL = 13
+    STYLE_JITTER = 14
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:

@@ -51,7 +51,8 @@ class StyleConsistency:
         """`style_gradient`, and `style_boundary` where there is a boundary; gradients flow to the field."""
         settings, seed = self._settings, seed_for(self._run_seed, Purpose.STYLE, step)
         points = self._points[chosen_rows(len(self._points), settings.style_samples, seed)]
-        moved = jittered(points, settings.style_jitter, torch.Generator().manual_seed(seed))
+        jitter_seed = seed_for(self._run_seed, Purpose.STYLE_JITTER, step)
+        moved = jittered(points, settings.style_jitter, torch.Generator().manual_seed(jitter_seed))
         losses = {"style_gradient": loss_style_gradient(field(points).style(), field(moved).style())}
         if len(self.boundary):
             rows = chosen_rows(len(self.boundary), settings.style_samples, seed)
