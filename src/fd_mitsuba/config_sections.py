@@ -138,7 +138,14 @@ class AppearanceConfig(Section):
 class GuidanceConfig(Section):
     model: str = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
-    variant: Literal["sds", "csd", "reconstruction"] = "sds"
+    variant: Literal["sds", "csd", "ism", "reconstruction"] = "sds"
+    """What makes the gradient; `guidance.variants` has the formulas."""
+    reconstruction_steps: Annotated[int, Field(ge=1, le=50)] = 4
+    """DDIM steps from z_t to the clean latents, for `reconstruction`."""
+    ism_interval: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """Distance between the two noise levels that `ism` compares, as a share of all timesteps."""
+    ism_inversion_step: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """Stride of the DDIM inversion up to the lower of them; each stride is one pass of the network."""
     guidance_scale: NonNegative = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: NonNegative = 1.0
@@ -147,11 +154,24 @@ class GuidanceConfig(Section):
     timestep_range_refined: Range = (0.02, 0.35)
     timestep_anneal: Fraction = 0.0
     """Share of the range by which the upper end has come down at the last step of a phase; 0 keeps it."""
+    timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
+    """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
     normalise_gradient: bool = False
     views_per_call: Count = 4
     """Pictures sent through the UNet at once; fewer need less memory."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d+)?)$")] = "cpu"
+    """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
+
+    @model_validator(mode="after")
+    def _one_annealing(self) -> GuidanceConfig:
+        if self.timestep_annealing != "none" and self.timestep_anneal > 0:
+            raise ValueError(
+                f"guidance.timestep_anneal = {self.timestep_anneal} and guidance.timestep_annealing = "
+                f"{self.timestep_annealing} both lower t; set one of them"
+            )
+        return self
 
 
 class CamerasConfig(Section):

@@ -76,6 +76,27 @@ def test_every_pipeline_guides(folders: dict[str, Path], kind: str) -> None:
     assert gradient_of(guidance, views).equal(gradient) and not gradient_of(guidance, views, step=1).equal(gradient)
 
 
+@pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction"])
+@pytest.mark.parametrize("kind", ["builtin", "sd15"])
+def test_every_variant_guides_three_steps(folders: dict[str, Path], kind: str, variant: str) -> None:
+    guidance = load(folders[kind], variant, guidance_scale=3.0)
+    views = views_of(guidance)
+    gradients = [gradient_of(guidance, views, step) for step in range(3)]
+    assert all(gradient.isfinite().all() and gradient.abs().max() > 0 for gradient in gradients)
+    assert gradient_of(guidance, views, 0).equal(gradients[0]) and not gradients[1].equal(gradients[0])
+    if kind == "builtin":
+        assert (gradients[0].abs()[views.part_mask.expand_as(gradients[0]) == 0] == 0).all()
+
+
+def test_a_real_model_serves_both_stages_from_one_copy(folders: dict[str, Path]) -> None:
+    geometry = DiffusionGuidance(components_of(folders["sd15"]), GuidanceConfig(model=str(folders["sd15"])))
+    both = geometry.for_appearance(AppearanceConfig(guidance_scale=3.0))
+    assert both.components.unet is geometry.components.unet and both.appearance.guidance_scale == 3.0
+    both.set_prompt("a horse with wings")
+    views = views_of(both)
+    assert gradient_of(both, views).equal(gradient_of(load(folders["sd15"], guidance_scale=3.0), views))
+
+
 @pytest.mark.parametrize("kind", ["builtin", "sd15", "ip2p"])
 def test_a_masked_gradient_stays_on_the_part(folders: dict[str, Path], kind: str) -> None:
     masked, free = (load(folders[kind], mask_guidance=choice) for choice in (True, False))

@@ -88,7 +88,12 @@ def test_three_steps_of_both_phases(folders: dict[str, Path], kind: str) -> None
 
 @pytest.mark.parametrize(
     ("kind", "phase", "variant"),
-    [("sd21", "refined", "sds"), ("ip2p", "refined", "csd"), ("ip2p", "coarse", "reconstruction")],
+    [
+        ("sd21", "refined", "sds"),
+        ("ip2p", "refined", "csd"),
+        ("ip2p", "coarse", "reconstruction"),
+        ("sd15", "coarse", "ism"),
+    ],
 )
 def test_chunks_give_what_one_call_gives(folders: dict[str, Path], kind: str, phase: str, variant: str) -> None:
     settings = {"variant": variant, "image_guidance_scale": 1.5, "guidance_scale": 7.5, "normalise_gradient": True}
@@ -336,6 +341,34 @@ def test_anneal_lowers_the_timesteps(folders: dict[str, Path]) -> None:
     views = views_for(guidance, "coarse", 4)
     last = guidance.guide(views, 9, 10, "coarse", seed=0)
     assert last.logs["guidance_timestep"] == 200
+
+
+@pytest.mark.parametrize("annealing", ["linear", "sqrt"])
+def test_scheduled_timesteps_are_the_same_for_all_views(folders: dict[str, Path], annealing: str) -> None:
+    guidance = load(folders["sd15"], timestep_range_coarse=(0.2, 0.9), timestep_annealing=annealing)
+    views = views_for(guidance, "coarse", 2)
+    due = [guidance.guide(views, step, 5, "coarse", seed=0).logs["guidance_timestep"] for step in range(5)]
+    assert due == ([899, 724, 549, 375, 200] if annealing == "linear" else [899, 549, 405, 293, 200])
+    assert not gradient_of(guidance, views, "coarse").equal(gradient_of(guidance, views, "coarse", seed=4))
+
+
+@pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction"])
+@pytest.mark.parametrize("kind", ["sd15", "sd21", "ip2p"])
+def test_every_variant_guides_every_layout(folders: dict[str, Path], kind: str, variant: str) -> None:
+    guidance = load(folders[kind], variant=variant, guidance_scale=7.5, image_guidance_scale=1.5)
+    for phase in ("coarse", "refined"):
+        views = views_for(guidance, phase, 1)
+        first = gradient_of(guidance, views, phase, step=1)
+        assert first.isfinite().all() and first[:, :4].abs().max() > 0
+        assert gradient_of(guidance, views, phase, step=1).equal(first)
+
+
+def test_a_device_that_is_not_there_is_told_before_loading(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loading, "_load", lambda *_: pytest.fail("loaded all the same"))
+    with pytest.raises(UserError, match=r"guidance.device = 'cuda:99': .* set guidance.device to cpu"):
+        DiffusionGuidance.load(GuidanceConfig(model=str(folders["sd15"]), device="cuda:99"))
 
 
 def test_half_precision_network(folders: dict[str, Path]) -> None:

@@ -173,6 +173,37 @@ def test_settings_cannot_be_changed() -> None:
         RunConfig().geometry.steps = 3  # type: ignore[misc]
 
 
+LATER = ["reconstruction_steps=9", "ism_interval=0.1", "ism_inversion_step=0.1", "timestep_annealing=sqrt"]
+
+
+def test_later_settings_count_only_when_they_are_changed() -> None:
+    """So that runs from before can still be read; the device never counts."""
+    hashes = [load_config(None, [f"guidance.{override}"]).content_hash() for override in LATER]
+    assert len({RunConfig().content_hash(), *hashes}) == len(LATER) + 1
+    assert load_config(None, ["guidance.device=cuda:1"]).content_hash() == RunConfig().content_hash()
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("variant=isn", "'sds', 'csd', 'ism' or 'reconstruction'"),
+        ("timestep_annealing=cosine", "'none', 'linear' or 'sqrt'"),
+        ("reconstruction_steps=0", "reconstruction_steps"),
+        ("ism_interval=0", "ism_interval"),
+        ("ism_inversion_step=1.5", "ism_inversion_step"),
+        ("device=gpu", "device"),
+    ],
+)
+def test_bad_guidance_is_one_line(override: str, expected: str) -> None:
+    message = refusal(None, f"guidance.{override}")
+    assert expected in message and f"--set guidance.{override}" in message
+
+
+def test_two_ways_to_lower_t_are_refused() -> None:
+    message = refusal(None, "guidance.timestep_anneal=0.5", "guidance.timestep_annealing=linear")
+    assert "both lower t" in message
+
+
 def test_hash_follows_every_setting() -> None:
     overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "output.sheet_every=3", "cameras.aim=object"]
     hashes = [load_config(None, [override]).content_hash() for override in overrides]

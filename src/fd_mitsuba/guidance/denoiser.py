@@ -1,9 +1,6 @@
-"""From noisy latents to the guidance gradient: a UNet's passes, put together as `sds` says. Knows no pictures."""
+"""From noisy latents to the guidance gradient: a UNet's passes, put together by a variant. Knows no pictures."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,35 +10,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
-
-RECONSTRUCTION_STEPS = 4
-"""DDIM steps from z_t down to the clean latents, for the variant `reconstruction`."""
-
-
-@dataclass(frozen=True)
-class Distillation:
-    """How the gradient is made in one phase; the names are those of the settings."""
-
-    variant: Literal["sds", "csd", "reconstruction"]
-    weighting: sds.Weighting
-    guidance_scale: float
-    image_guidance_scale: float
-    timestep_range: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """What the network needs for some pictures: all (n, ...), on its device, without gradients.
-
-    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere.
-    """
-
-    z: Tensor
-    noise: Tensor
-    timesteps: Tensor
-    texts: dict[str, Tensor]
-    condition: Tensor | None
-    mask: Tensor | None
+from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, Query, passes_of
 
 
 class Denoiser:
@@ -94,43 +63,12 @@ class Denoiser:
             for name, output in zip(texts, torch.cat(outputs).chunk(passes), strict=True)
         }
 
-    def coefficients(self, how: Distillation) -> dict[str, float]:
-        """Passes of the network that the variant and the scales ask for, with their coefficients."""
-        if how.variant == "csd":
-            return {"text": 1.0, "image" if self.needs_base else "plain": -1.0}
-        if self.needs_base:
-            return sds.cfg_coefficients_with_image(how.guidance_scale, how.image_guidance_scale)
-        return sds.cfg_coefficients(how.guidance_scale)
+    def passes(self, how: Distillation) -> tuple[str, ...]:
+        """Names of the network's passes that the variant and the scales ask for."""
+        return passes_of(how, self.needs_base)
 
     @torch.no_grad()
     def latent_gradient(self, chunk: Chunk, how: Distillation) -> tuple[Tensor, Tensor]:
         """Gradient with respect to z, and the clean latents that the network sees in z_t."""
-        alpha_bar = self.alpha_bars[chunk.timesteps]
-        weights = sds.weight(how.weighting, alpha_bar)
-        noise = chunk.noise if chunk.mask is None else chunk.noise * chunk.mask
-        z_t = sds.add_noise(chunk.z, noise, alpha_bar)
-        predictions = self.predict_noise(z_t, chunk.timesteps, chunk.texts, chunk.condition)
-        if how.variant == "csd":
-            preview = sds.clean_estimate(z_t, predictions["text"], alpha_bar)
-            plain = predictions["image" if self.needs_base else "plain"]
-            gradient = sds.csd_gradient(predictions["text"], plain, weights)
-        else:
-            noise_hat = sds.combine(predictions, self.coefficients(how))
-            if how.variant == "reconstruction":
-                preview = self._denoise(z_t, noise_hat, chunk, how)
-                gradient = sds.reconstruction_gradient(chunk.z, preview, weights)
-            else:
-                preview = sds.clean_estimate(z_t, noise_hat, alpha_bar)
-                gradient = sds.sds_gradient(noise_hat, noise, weights)
+        gradient, preview = VARIANTS[how.variant](Query(self, chunk, how))
         return gradient if chunk.mask is None else gradient * chunk.mask, preview
-
-    def _denoise(self, z_t: Tensor, noise_hat: Tensor, chunk: Chunk, how: Distillation) -> Tensor:
-        """Clean latents after RECONSTRUCTION_STEPS DDIM steps, evenly spaced from t; the first prediction is given."""
-        now = chunk.timesteps
-        for remaining in range(RECONSTRUCTION_STEPS - 1, 0, -1):
-            following = chunk.timesteps * remaining // RECONSTRUCTION_STEPS
-            z_t = sds.ddim_step(z_t, noise_hat, self.alpha_bars[now], self.alpha_bars[following])
-            now = following
-            predictions = self.predict_noise(z_t, now, chunk.texts, chunk.condition)
-            noise_hat = sds.combine(predictions, self.coefficients(how))
-        return sds.clean_estimate(z_t, noise_hat, self.alpha_bars[now])

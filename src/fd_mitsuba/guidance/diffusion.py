@@ -7,6 +7,7 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import get_args
 
 import numpy as np
@@ -18,11 +19,13 @@ from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config_sections import AppearanceConfig
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.colour_latents import colour_latents
-from fd_mitsuba.guidance.denoiser import Chunk, Denoiser, Distillation
+from fd_mitsuba.guidance.denoiser import Denoiser
+from fd_mitsuba.guidance.device import require_device
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
+from fd_mitsuba.guidance.variants import Chunk, Distillation
 from fd_mitsuba.threads import network_threads
 
 MASK_THRESHOLD = 0.1
@@ -54,21 +57,29 @@ class DiffusionGuidance(Denoiser):
         self.vae_scale_factor = 2 ** (len(vae.get("encoder_block_out_channels") or vae.block_out_channels) - 1)
         self.scaling_factor = float(vae.get("scaling_factor") or 1.0)
         self.shift_factor = float(vae.get("shift_factor") or 0.0)
-        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder)
+        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device)
         self._prompt: str | None = None
         self._negative_prompt = ""
 
     @classmethod
     def load(
-        cls, config: GuidanceConfig, device: str = "cpu", appearance: AppearanceConfig | None = None
+        cls, config: GuidanceConfig, device: str | None = None, appearance: AppearanceConfig | None = None
     ) -> DiffusionGuidance:
         """The guidance of `config.model`. Raises UserError as `loading.load_components` does.
 
         Args:
+            device: instead of `config.device`.
             appearance: the settings of `guide_appearance`. With them the model `builtin` is the prior of colours, which
                 serves that stage alone; a real model serves both.
         """
-        return cls(load_components(config, device, appearance is not None), config, device, appearance)
+        place = str(require_device(device or config.device))
+        return cls(load_components(config, place, appearance is not None), config, place, appearance)
+
+    def for_appearance(self, appearance: AppearanceConfig) -> DiffusionGuidance:
+        """The guidance of the appearance stage; with the same networks in memory, unless the model is `builtin`."""
+        if self.config.model == "builtin":
+            return self.load(self.config, str(self.device), appearance)
+        return type(self)(self.components, self.config, str(self.device), appearance)
 
     def picture_size(self, phase: Phase) -> int:
         """Side in pixels of one view: the latents' own in the coarse phase, the VAE's input in the others."""
@@ -167,7 +178,7 @@ class DiffusionGuidance(Denoiser):
         mask: Tensor | None = None,
     ) -> GuidanceResult:
         how, count = self._how(phase), len(images)
-        texts = self.embeddings(prompts, self.coefficients(how))
+        texts = self.embeddings(prompts, self.passes(how))
         rows_per_chunk = max(1, self.config.views_per_call // len(texts))
         track = images.requires_grad and torch.is_grad_enabled()
 
@@ -202,6 +213,7 @@ class DiffusionGuidance(Denoiser):
         loss = images.new_tensor(value)
         if track:
             loss = sds.carry_gradient(images, scale * torch.cat(picture_gradients), value)
+        loss = loss.cpu()  # beside the other losses, which know no other device
         logs = {
             "guidance_loss": value,
             "guidance_gradient_mean": float(gradient.abs().mean()),
@@ -217,10 +229,17 @@ class DiffusionGuidance(Denoiser):
             settings = self.config
             bounds = settings.timestep_range_refined if phase == "refined" else settings.timestep_range_coarse
         return Distillation(
-            self.config.variant, settings.weighting, settings.guidance_scale, settings.image_guidance_scale, bounds
+            self.config.variant,
+            settings.weighting,
+            settings.guidance_scale,
+            settings.image_guidance_scale,
+            bounds,
+            self.config.reconstruction_steps,
+            self.config.ism_interval,
+            self.config.ism_inversion_step,
         )
 
-    def embeddings(self, prompts: list[str], passes: dict[str, float]) -> dict[str, Tensor]:
+    def embeddings(self, prompts: list[str], passes: Iterable[str]) -> dict[str, Tensor]:
         """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt."""
         negative = [self._negative_prompt] * len(prompts)
         return {name: self._embed(prompts if name == "text" else negative) for name in passes}
@@ -244,12 +263,13 @@ class DiffusionGuidance(Denoiser):
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
         key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase)))
         generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
-        bounds = sds.annealed_range(
-            self._how(phase).timestep_range,
-            self.config.timestep_anneal,
-            min(step / max(steps_total - 1, 1), 1.0),
-        )
-        timesteps = sds.draw_timesteps(bounds, len(self.alpha_bars), count, generator)
+        config, bounds = self.config, self._how(phase).timestep_range
+        progress, levels = min(step / max(steps_total - 1, 1), 1.0), len(self.alpha_bars)
+        if config.timestep_annealing == "none":
+            bounds = sds.annealed_range(bounds, config.timestep_anneal, progress)
+            timesteps = sds.draw_timesteps(bounds, levels, count, generator)
+        else:
+            timesteps = sds.scheduled_timesteps(bounds, levels, count, config.timestep_annealing, progress)
         noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
         return timesteps.to(self.device), noise.to(self.device)
 

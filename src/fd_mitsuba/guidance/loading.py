@@ -50,6 +50,8 @@ class Components:
 def load_components(config: GuidanceConfig, device: str = "cpu", appearance: bool = False) -> Components:
     """The components of `config.model`, in `config.dtype` (the VAE in float32, since gradients flow through it).
 
+    Beside another device the text encoder stays on the CPU, in float32: it reads each text once.
+
     Args:
         appearance: `builtin` means the prior of colours, not the one of shapes.
 
@@ -65,9 +67,10 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
     size = BYTES[config.dtype]
+    text_size = size if torch.device(device).type == "cpu" else 0
     latent_size = latent_side(configs["unet"])
     require_memory(
-        counts["unet"] * size + counts["text_encoder"] * size + counts["vae"] * 4,
+        counts["unet"] * size + counts["text_encoder"] * text_size + counts["vae"] * 4,
         working_set_bytes(configs["unet"], configs["vae"], latent_size, config.views_per_call, config.dtype),
         device,
         str(folder),
@@ -143,6 +146,7 @@ def _load(
     import transformers
 
     dtype = getattr(torch, config.dtype)
+    on_cpu = torch.device(device).type == "cpu"
     scheduler_class = getattr(diffusers, index["scheduler"][1], None)
     if scheduler_class is None:
         raise UserError(
@@ -152,7 +156,7 @@ def _load(
     for part, owner, kind in (
         ("unet", diffusers.UNet2DConditionModel, dtype),
         ("vae", getattr(diffusers, index["vae"][1]), torch.float32),
-        ("text_encoder", transformers.CLIPTextModel, dtype),
+        ("text_encoder", transformers.CLIPTextModel, dtype if on_cpu else torch.float32),
     ):
         key = "torch_dtype" if part != "text_encoder" else "dtype"
         with _one_line(folder / part), _quiet():
@@ -169,7 +173,7 @@ def _load(
             raise UserError(
                 f"{folder / part}: the weights lack {len(missing)} tensors, {missing[0]} first; fetch the file again"
             )
-        loaded[part] = model.requires_grad_(False).eval().to(device)
+        loaded[part] = model.requires_grad_(False).eval().to("cpu" if part == "text_encoder" else device)
     with _one_line(folder / "tokenizer"), _quiet():
         # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"

@@ -64,11 +64,13 @@ class TextEmbeddings:
     Args:
         tokenizer: a CLIP tokenizer; texts are padded to its `model_max_length` and cut there, with a warning.
         text_encoder: a `CLIPTextModel`; its last hidden state is the embedding, as in diffusers' pipelines.
+        device: where the embeddings go; None: they stay on the encoder's.
     """
 
-    def __init__(self, tokenizer: Any, text_encoder: torch.nn.Module) -> None:
+    def __init__(self, tokenizer: Any, text_encoder: torch.nn.Module, device: torch.device | str | None = None) -> None:
         self.tokenizer = tokenizer
         self.text_encoder = text_encoder
+        self.device = device
         # A tokenizer saved without its length reports a huge number; the position table is the true limit.
         positions = text_encoder.config.max_position_embeddings
         self.length = min(tokenizer.model_max_length, positions)
@@ -76,7 +78,7 @@ class TextEmbeddings:
 
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> torch.Tensor:
-        """Embeddings (len(texts), length, width) in the encoder's dtype and on its device."""
+        """Embeddings (len(texts), length, width) in the encoder's dtype."""
         self._encode(text for text in dict.fromkeys(texts) if text not in self._cache)
         return torch.cat([self._cache[text] for text in texts])
 
@@ -91,4 +93,5 @@ class TextEmbeddings:
             # Only encoders that were trained with a mask get one: Stable Diffusion attends to the padding too.
             masked = getattr(self.text_encoder.config, "use_attention_mask", False)
             mask = tokens.attention_mask.to(device) if masked else None
-            self._cache[text] = self.text_encoder(tokens.input_ids.to(device), attention_mask=mask)[0]
+            embedding = self.text_encoder(tokens.input_ids.to(device), attention_mask=mask)[0]
+            self._cache[text] = embedding.to(self.device or device)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 Weighting = Literal["sds", "uniform", "fantasia3d", "inverse"]
 PredictionType = Literal["epsilon", "v_prediction", "sample"]
+Annealing = Literal["linear", "sqrt"]
 
 
 def _per_latent(values: Tensor) -> Tensor:
@@ -52,6 +53,22 @@ def draw_timesteps(bounds: tuple[float, float], train_timesteps: int, count: int
     draw = torch.rand(count, generator=generator, dtype=torch.float64)
     timesteps = (low + draw * (high - low + 1)).floor().long().clamp(max=high)
     return timesteps.clamp(1, train_timesteps - 1)
+
+
+def scheduled_timesteps(
+    bounds: tuple[float, float], train_timesteps: int, count: int, annealing: Annealing, progress: float
+) -> Tensor:
+    """`count` times the one timestep (int64, CPU) that is due at `progress` in [0, 1]; nothing is random.
+
+        linear: t = high - (high - low) progress           (DreamTime, arXiv 2306.12422, with an even weight)
+        sqrt:   t = high - (high - low) sqrt(progress)     (HiFA, arXiv 2305.18766)
+
+    `bounds` and limits as in `draw_timesteps`.
+    """
+    low, high = (bound * (train_timesteps - 1) for bound in bounds)
+    share = progress if annealing == "linear" else progress**0.5
+    due = round(high - (high - low) * share)
+    return torch.full((count,), min(max(due, 1), train_timesteps - 1))
 
 
 def add_noise(z: Tensor, noise: Tensor, alpha_bar: Tensor) -> Tensor:

@@ -1,0 +1,29 @@
+"""Whether torch can compute where `guidance.device` says."""
+
+from __future__ import annotations
+
+import torch
+
+from fd_mitsuba.errors import UserError
+
+
+def require_device(name: str) -> torch.device:
+    """The torch device of a name: `cpu`, `cuda`, `cuda:1`, `mps`.
+
+    Raises:
+        UserError: torch was built without it, or this machine has no such device.
+    """
+    device = torch.device(name)
+    if device.type == "cuda":
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if count <= (device.index or 0):
+            found = f"{count} CUDA device{'' if count == 1 else 's'}"
+            raise UserError(
+                f"guidance.device = {name!r}: torch {torch.__version__} finds {found}; set guidance.device to cpu, or "
+                "install a driver and a CUDA build of torch"
+            )
+    if device.type == "mps" and not torch.backends.mps.is_available():
+        raise UserError(
+            f"guidance.device = {name!r}: torch {torch.__version__} finds no Apple GPU; set guidance.device to cpu"
+        )
+    return device

@@ -1,0 +1,199 @@
+"""The variants of `guidance.variant`: how a diffusion model's noise becomes a gradient for clean latents.
+
+Symbols as in `sds`; g is the gradient with respect to z, z_hat the clean latents it pulls towards. e(text) is the noise
+that the network sees with the prompt, e(free) that without: with the negative prompt, and for a network that sees the
+base with the base's picture. e_hat is classifier-free guidance of the two (`sds.cfg_coefficients`).
+
+The network itself, a `Network`, may predict e, v or z and take 4 or 8 channels; no variant knows which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+
+from fd_mitsuba.guidance import sds
+
+Variant = Literal["sds", "csd", "ism", "reconstruction"]
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """How the gradient is made in one phase; the names are those of the settings."""
+
+    variant: Variant
+    weighting: sds.Weighting
+    guidance_scale: float
+    image_guidance_scale: float
+    timestep_range: tuple[float, float]
+    reconstruction_steps: int = 4
+    ism_interval: float = 0.05
+    ism_inversion_step: float = 0.2
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What the network needs for some pictures: all (n, ...), on its device, without gradients.
+
+    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere.
+    """
+
+    z: Tensor
+    noise: Tensor
+    timesteps: Tensor
+    texts: dict[str, Tensor]
+    condition: Tensor | None
+    mask: Tensor | None
+
+
+class Network(Protocol):
+    """What the variants ask of `denoiser.Denoiser`."""
+
+    needs_base: bool
+    alpha_bars: Tensor
+
+    def predict_noise(
+        self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], condition: Tensor | None
+    ) -> dict[str, Tensor]: ...
+
+
+@dataclass(frozen=True)
+class Query:
+    """One chunk before one network: what the variants are written with."""
+
+    network: Network
+    chunk: Chunk
+    how: Distillation
+
+    @property
+    def free(self) -> str:
+        return free_pass(self.network.needs_base)
+
+    @property
+    def noise(self) -> Tensor:
+        """The drawn noise, where the mask lets it."""
+        return self.chunk.noise if self.chunk.mask is None else self.chunk.noise * self.chunk.mask
+
+    def alpha_bar(self, timesteps: Tensor) -> Tensor:
+        return self.network.alpha_bars[timesteps]
+
+    def weights(self) -> Tensor:
+        """w(t) at the drawn timesteps."""
+        return sds.weight(self.how.weighting, self.alpha_bar(self.chunk.timesteps))
+
+    def noised(self, timesteps: Tensor) -> Tensor:
+        """z with the drawn noise at these levels."""
+        return sds.add_noise(self.chunk.z, self.noise, self.alpha_bar(timesteps))
+
+    def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
+        """Noise of each named pass."""
+        texts = {name: text for name, text in self.chunk.texts.items() if name in names}
+        return self.network.predict_noise(z_t, timesteps, texts, self.chunk.condition)
+
+    def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
+        """e_hat: classifier-free guidance."""
+        coefficients = guidance_coefficients(self.how, self.network.needs_base)
+        return sds.combine(self.passes(z_t, timesteps, coefficients), coefficients)
+
+    def move(self, z_t: Tensor, noise_hat: Tensor, now: Tensor, to: Tensor) -> Tensor:
+        """A DDIM step to the levels `to`, up or down. Outside the mask z stays what it is, without noise."""
+        moved = sds.ddim_step(z_t, noise_hat, self.alpha_bar(now), self.alpha_bar(to))
+        if self.chunk.mask is None:
+            return moved
+        outside = sds.add_noise(self.chunk.z, torch.zeros_like(moved), self.alpha_bar(to))
+        return torch.where(self.chunk.mask > 0, moved, outside)
+
+
+def score_distillation(query: Query) -> tuple[Tensor, Tensor]:
+    """g = w(t) (e_hat(z_t) - e): SDS (DreamFusion, arXiv 2209.14988; the paper's section "Preliminary")."""
+    timesteps = query.chunk.timesteps
+    z_t = query.noised(timesteps)
+    noise_hat = query.guided(z_t, timesteps)
+    preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
+    return sds.sds_gradient(noise_hat, query.noise, query.weights()), preview
+
+
+def classifier_score(query: Query) -> tuple[Tensor, Tensor]:
+    """g = w(t) (e(text; z_t) - e(free; z_t)): CSD (arXiv 2310.19415). The guidance scale plays no part in it."""
+    timesteps = query.chunk.timesteps
+    z_t = query.noised(timesteps)
+    seen = query.passes(z_t, timesteps, ("text", query.free))
+    preview = sds.clean_estimate(z_t, seen["text"], query.alpha_bar(timesteps))
+    return sds.csd_gradient(seen["text"], seen[query.free], query.weights()), preview
+
+
+def interval_score(query: Query) -> tuple[Tensor, Tensor]:
+    """g = w(t) (e_hat(z_t) - e(free; z_s)): ISM (LucidDreamer, arXiv 2311.11284).
+
+    s = t - delta_T. z_s is z carried from timestep 0 to s by DDIM inversion in steps of delta_S, z_t is z_s carried one
+    step further, both by e(free): the drawn noise enters at timestep 0 only, where there is next to none. A picture
+    whose s is reached waits for its neighbours, and its result does not depend on them.
+    """
+    last, how = len(query.network.alpha_bars) - 1, query.how
+    interval, stride = (max(1, round(share * last)) for share in (how.ism_interval, how.ism_inversion_step))
+    end = query.chunk.timesteps
+    start = (end - interval).clamp(min=0)
+    now = torch.zeros_like(end)
+    z_s = query.noised(now)
+    for _ in range(-(-int(start.max()) // stride)):
+        following = torch.minimum(now + stride, start)
+        moved = query.move(z_s, query.passes(z_s, now, (query.free,))[query.free], now, following)
+        z_s = torch.where((following > now).view(-1, 1, 1, 1), moved, z_s)
+        now = following
+    noise_start = query.passes(z_s, start, (query.free,))[query.free]
+    z_t = query.move(z_s, noise_start, start, end)
+    noise_hat = query.guided(z_t, end)
+    preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(end))
+    return sds.sds_gradient(noise_hat, noise_start, query.weights()), preview
+
+
+def reconstruction(query: Query) -> tuple[Tensor, Tensor]:
+    """g = w(t) (z - z_hat), z_hat after DDIM steps from z_t by e_hat (HiFA, arXiv 2305.18766).
+
+    With many steps z_hat is the edited picture of an iterative dataset update (Instruct-NeRF2NeRF, arXiv 2303.12789).
+    The steps are evenly spaced from t to the clean latents.
+    """
+    now, steps = query.chunk.timesteps, query.how.reconstruction_steps
+    z_t = query.noised(now)
+    noise_hat = query.guided(z_t, now)
+    for remaining in range(steps - 1, 0, -1):
+        following = query.chunk.timesteps * remaining // steps
+        z_t = query.move(z_t, noise_hat, now, following)
+        now = following
+        noise_hat = query.guided(z_t, now)
+    z_hat = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(now))
+    return sds.reconstruction_gradient(query.chunk.z, z_hat, query.weights()), z_hat
+
+
+VARIANTS: dict[Variant, Callable[[Query], tuple[Tensor, Tensor]]] = {
+    "sds": score_distillation,
+    "csd": classifier_score,
+    "ism": interval_score,
+    "reconstruction": reconstruction,
+}
+"""Each gives g and z_hat, both (n, 4, L, L)."""
+
+
+def free_pass(needs_base: bool) -> str:
+    """Name of the pass without the prompt: a network that sees the base still sees it there."""
+    return "image" if needs_base else "plain"
+
+
+def guidance_coefficients(how: Distillation, needs_base: bool) -> dict[str, float]:
+    """The passes of classifier-free guidance with their coefficients."""
+    if needs_base:
+        return sds.cfg_coefficients_with_image(how.guidance_scale, how.image_guidance_scale)
+    return sds.cfg_coefficients(how.guidance_scale)
+
+
+def passes_of(how: Distillation, needs_base: bool) -> tuple[str, ...]:
+    """Names of all passes that the variant asks for; a pass without weight is left out."""
+    free = free_pass(needs_base)
+    if how.variant == "csd":
+        return "text", free
+    names = tuple(guidance_coefficients(how, needs_base))
+    return (*names, free) if how.variant == "ism" and free not in names else names
