@@ -89,11 +89,27 @@ def test_the_nearer_piece_is_seen() -> None:
 def test_portions_do_not_change_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, cameras, view = ball(3), views(0, 50, 120), GeometryPass(16)
     whole = view.render_primal(*mesh, cameras, 7)
-    assert torch.equal(whole, view.render(*mesh, cameras, 7))
+    torch.testing.assert_close(whole, view.render(*mesh, cameras, 7), atol=1e-5, rtol=0)  # drawn, not traced
     monkeypatch.setattr("fd_mitsuba.render.geometry_pass._RAYS_AT_ONCE", 2 * 4 * 16**2)
     assert torch.equal(whole, view.render_primal(*mesh, cameras, 7))
     many = view.render_primal(*mesh, cameras, 7, spp=64)
     assert (many - whole).abs().mean() < 0.02 and many.shape == (3, 5, 16, 16)
+
+
+def test_drawn_and_traced_faces_give_the_same_pictures_and_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures, gradients = [], []
+    for points_per_face in (0, 10**9):
+        monkeypatch.setattr("fd_mitsuba.render.mesh_tracer._POINTS_PER_FACE", points_per_face)
+        first, second = ball(3), ball(4, 0.3, (0.4, 0.1, 0.2))
+        vertices = torch.cat([first[0], second[0]]).requires_grad_()
+        faces = torch.cat([first[1], second[1] + len(first[0])])
+        weight = torch.cat([torch.zeros(len(first[0])), torch.ones(len(second[0]))])
+        picture = GeometryPass(24).render(vertices, faces, weight, views(0, 80), 3, static_faces=len(first[1]))
+        (picture * torch.linspace(-1, 1, picture.numel()).view_as(picture)).sum().backward()
+        pictures.append(picture.detach())
+        gradients.append(vertices.grad)
+    torch.testing.assert_close(*pictures, atol=1e-4, rtol=0)
+    assert (gradients[0] - gradients[1]).norm() < 0.01 * gradients[0].norm()
 
 
 @pytest.mark.parametrize("size", [1, 7])

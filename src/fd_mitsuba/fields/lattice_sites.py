@@ -118,11 +118,14 @@ class LatticeSites:
             if first == last:
                 continue
             depth, height, width = box.shape
-            full = gradient.new_zeros(self._grid_width, depth * height * width)
-            full.index_copy_(1, box.inside[chosen[first:last] - box.begin], gradient[:, first:last])
+            full = gradient.new_zeros(self._features, depth * height * width)
+            places = box.inside[chosen[first:last] - box.begin]
             for number, level in enumerate(box.levels):
                 along_x, along_y, along_z = level.matrices
-                values = full[number * self._features : (number + 1) * self._features].view(-1, width)
+                # Every level fills the same places, so what lies between them stays 0.
+                rows = gradient[number * self._features : (number + 1) * self._features]
+                full.index_copy_(1, places, rows[:, first:last])
+                values = full.view(-1, width)
                 values = values if along_x is None else values @ along_x
                 values = _times(_transposed(along_y), values.view(-1, height, level.shape[2]))
                 values = _times(_transposed(along_z), values.view(self._features, depth, -1))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.mesh_tracer import MeshTracer
+from fd_mitsuba.render.mesh_tracer import Hit
 from fd_mitsuba.render.outline_points import OutlinePoints
 from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, channels, shade_hit
 from fd_mitsuba.render.upload import upload_floats, upload_indices
@@ -22,12 +24,46 @@ _NEARER = 1e-4
 """What lies in front of an outline point by more than this share of its depth hides it."""
 
 
+@dataclass(frozen=True)
+class UploadedPoints:
+    """`OutlinePoints` in Dr.Jit."""
+
+    view: mi.UInt32
+    film: mi.Point2f
+    beside: mi.Point2f
+    """Film points just outside the outline."""
+    outwards: mi.Vector2f
+    vertices: tuple[mi.UInt32, mi.UInt32]
+    along: mi.Float
+    depth: mi.Float
+    length: mi.Float
+
+    def __len__(self) -> int:
+        return dr.width(self.view)
+
+
+def upload_points(points: OutlinePoints, size: int) -> UploadedPoints:
+    """At least one point, on the outline in pictures of `size` pixels a side."""
+    film = mi.Point2f(upload_floats(points.film[:, 0]), upload_floats(points.film[:, 1]))
+    outwards = mi.Vector2f(upload_floats(points.outwards[:, 0]), upload_floats(points.outwards[:, 1]))
+    return UploadedPoints(
+        upload_indices(points.view),
+        film,
+        film + (_STEP_ASIDE * size) * outwards,
+        outwards,
+        (upload_indices(points.vertices[:, 0]), upload_indices(points.vertices[:, 1])),
+        upload_floats(points.along),
+        upload_floats(points.depth),
+        upload_floats(points.length),
+    )
+
+
 def add_boundary_term(
     picture: list[mi.Float],
     mesh: ShadedMesh,
-    tracer: MeshTracer,
     cameras: FilmCameras,
-    points: OutlinePoints,
+    points: UploadedPoints,
+    behind: Hit,
     space: NormalSpace,
 ) -> None:
     """Attaches the outline's derivative to a picture, whose values stay as they are.
@@ -40,29 +76,22 @@ def add_boundary_term(
     Args:
         picture: five arrays of B size^2 pixels, changed in place.
         points: on the outline of `mesh`, in pictures of the same size.
+        behind: what is seen at `points.beside`.
     """
-    if not len(points.view):
-        return
-    view = upload_indices(points.view)
-    camera = cameras.at(view)
-    film = mi.Point2f(upload_floats(points.film[:, 0]), upload_floats(points.film[:, 1]))
-    outwards = mi.Vector2f(upload_floats(points.outwards[:, 0]), upload_floats(points.outwards[:, 1]))
-    first, second = (upload_indices(points.vertices[:, k]) for k in range(2))
-    along, depth, length = upload_floats(points.along), upload_floats(points.depth), upload_floats(points.length)
-
-    beside = camera.ray(film + (_STEP_ASIDE * cameras.size) * outwards)
-    behind = tracer.trace(beside, coherent=True)
-    visible = behind.depth > depth * (1 - _NEARER)
+    camera = cameras.at(points.view)
+    beside = camera.ray(points.beside)
+    visible = behind.depth > points.depth * (1 - _NEARER)
+    film, view, along, (first, second) = points.film, points.view, points.along, points.vertices
     with dr.suspend_grad():
         everywhere = mi.Bool(True)
         normal, part = mesh.blend([first, second], [1 - along, along], everywhere)
         inside = channels(normal, part, everywhere, camera, space)
         outside = shade_hit(mesh, beside, behind, camera, space)
-        jump = [dr.select(visible, (a - b) * length, 0) for a, b in zip(inside, outside, strict=True)]
+        jump = [dr.select(visible, (a - b) * points.length, 0) for a, b in zip(inside, outside, strict=True)]
         dr.eval(jump)
 
     point = (1 - along) * mesh.positions(first, everywhere) + along * mesh.positions(second, everywhere)
-    motion = dr.dot(outwards, camera.film(point))
+    motion = dr.dot(points.outwards, camera.film(point))
     if not dr.grad_enabled(motion):  # only part weights are wanted, and those do not move outlines
         return
     size = cameras.size

@@ -29,9 +29,19 @@ class FilmCamera:
 
     def ray(self, film: mi.Point2f) -> mi.Ray3f:
         """The ray through a film point; its parameter t is the depth (the direction is not of unit length)."""
+        slope = self.slope(film)
+        return mi.Ray3f(self.position, slope.x * self.right + slope.y * self.up - self.back)
+
+    def slope(self, film: mi.Point2f) -> mi.Vector2f:
+        """How far to the right, and upwards, a film point's ray goes for one unit of depth."""
         x = (film.x * (2.0 / self.size) - 1.0) * self.half_width
         y = (1.0 - film.y * (2.0 / self.size)) * self.half_width
-        return mi.Ray3f(self.position, x * self.right + y * self.up - self.back)
+        return mi.Vector2f(x, y)
+
+    def from_eye(self, point: mi.Point3f) -> mi.Vector3f:
+        """A point as seen from this camera: to the right, upwards, depth."""
+        offset = point - self.position
+        return mi.Vector3f(dr.dot(self.right, offset), dr.dot(self.up, offset), -dr.dot(self.back, offset))
 
     def film(self, point: mi.Point3f) -> mi.Point2f:
         """Where a point in front of the camera lies on the film; differentiable in the point."""

@@ -9,11 +9,11 @@ import torch
 from fd_mitsuba import mitsuba_api
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS
 from fd_mitsuba.render import bridge
-from fd_mitsuba.render.boundary_term import add_boundary_term
+from fd_mitsuba.render.boundary_term import add_boundary_term, upload_points
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.film_samples import film_position, opaque_seed
 from fd_mitsuba.render.mesh_check import CheckedMesh, check_mesh
-from fd_mitsuba.render.mesh_tracer import MeshTracer
+from fd_mitsuba.render.mesh_tracer import Hit, MeshTracer
 from fd_mitsuba.render.outline_points import sample_outline
 from fd_mitsuba.render.silhouette import SilhouetteFinder
 from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
@@ -96,12 +96,21 @@ class GeometryPass:
 
         def draw(positions: mi.Float, weights: mi.Float, normals: mi.Float) -> mi.Float:
             surface = ShadedMesh(positions, upload_indices(mesh.faces), weights, normals)
-            picture = self._interior(surface, views, self.spp, seed)
+            uploaded = (dr.detach(positions), surface.faces)
+            film, view = _film_points(views, self.spp, seed)
+            pixel_samples, points = dr.width(view), None
             if wanted:
-                uploaded = (dr.detach(positions), surface.faces)
                 outline = self._silhouettes.outline(mesh.vertices, mesh.faces, views, mesh.static_faces, uploaded)
-                points = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
-                add_boundary_term(picture, surface, self._tracer, views, points, self.normal_space)
+                drawn = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
+                if len(drawn.view):
+                    points = upload_points(drawn, self.size)
+                    view = dr.concat([view, points.view])
+                    film = mi.Point2f(*(dr.concat([a, b]) for a, b in zip(film, points.beside, strict=True)))
+            hit = self._tracer.see(views, film, view, uploaded)
+            picture = self._shade(surface, views, self.spp, seed, hit.part(0, pixel_samples))
+            if points is not None:
+                behind = hit.part(pixel_samples, pixel_samples + len(points))
+                add_boundary_term(picture, surface, views, points, behind, self.normal_space)
             return _join(picture)
 
         flat = bridge.differentiable(draw, vertices, part_weight, normals)
@@ -119,7 +128,7 @@ class GeometryPass:
     ) -> torch.Tensor:
         """The same pictures without gradients, with any number of views and samples: they are traced in portions.
 
-        With the `spp` of the pass (None) the values are those of `render`.
+        With the `spp` of the pass (None) the values are those of `render`, but for rounding: here every ray is traced.
 
         Raises:
             ValueError: as `render`.
@@ -172,17 +181,27 @@ class GeometryPass:
         return vertex_normals(vertices, faces)
 
     def _interior(self, mesh: ShadedMesh, cameras: FilmCameras, spp: int, seed: int) -> list[mi.Float]:
-        """Five arrays of B size^2 pixels: averages over jittered samples, attached."""
-        pixels = self.size**2
-        lane = dr.arange(mi.UInt32, cameras.count * pixels * spp)
-        place, view = lane // spp, lane // (spp * pixels)
+        """Five arrays of B size^2 pixels: averages over jittered samples, all of them traced."""
+        film, view = _film_points(cameras, spp, seed)
+        hit = self._tracer.trace(cameras.at(view).ray(film), coherent=True)
+        return self._shade(mesh, cameras, spp, seed, hit)
+
+    def _shade(self, mesh: ShadedMesh, cameras: FilmCameras, spp: int, seed: int, hit: Hit) -> list[mi.Float]:
+        """The averages of given hits, attached."""
+        film, view = _film_points(cameras, spp, seed)
         camera = cameras.at(view)
-        ray = camera.ray(film_position(place % pixels, lane % spp, spp, self.size, view + opaque_seed(seed)))
-        hit = self._tracer.trace(ray, coherent=True)
-        samples = shade_hit(mesh, ray, hit, camera, self.normal_space)
+        samples = shade_hit(mesh, camera.ray(film), hit, camera, self.normal_space)
         dr.eval(samples)  # together: the sums below would each repeat the shading
         # The samples of a pixel are neighbours: their sum has a fixed order, unlike atomic additions.
         return [dr.block_sum(sample, spp) / spp for sample in samples]
+
+
+def _film_points(cameras: FilmCameras, spp: int, seed: int) -> tuple[mi.Point2f, mi.UInt32]:
+    """Where the jittered samples of all pixels lie, and their views."""
+    pixels = cameras.size**2
+    lane = dr.arange(mi.UInt32, cameras.count * pixels * spp)
+    place, view = lane // spp, lane // (spp * pixels)
+    return film_position(place % pixels, lane % spp, spp, cameras.size, view + opaque_seed(seed)), view
 
 
 def _some(cameras: CameraBatch, begin: int, end: int) -> CameraBatch:
