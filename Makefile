@@ -36,6 +36,8 @@ test: $(STAMP) llvm
 
 bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json
+	$(PY) benchmarks/appearance_step.py --json
+	$(PY) benchmarks/export_part.py --json
 
 lint: $(STAMP)
 	$(PY) -m ruff check .

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import sys
 import time
@@ -29,10 +28,8 @@ from fd_mitsuba.threads import share_cores  # noqa: E402
 
 share_cores()
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from machine import kernels_compiled, machine, resident_mb  # noqa: E402
 from plain_appearance import PlainAppearance, uv_ball  # noqa: E402
 
 from fd_mitsuba.config import CamerasConfig  # noqa: E402
@@ -93,29 +90,11 @@ class Bench:
         self.optimiser.step()
 
 
-def kernels_compiled(bench: Bench) -> int:
-    """How many kernels Dr.Jit had to compile, or to read from its disk cache, in the counted steps."""
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    try:
-        dr.kernel_history_clear()
-        for _ in range(COUNTED_STEPS):
-            bench.fast_step()
-        return sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
-    finally:
-        dr.set_flag(dr.JitFlag.KernelHistory, False)
-
-
-def resident_mb() -> float:
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 2**20
-
-
 def measure(bench: Bench, repeats: int, plain_repeats: int) -> dict[str, Any]:
     """The figures of the module's docstring."""
     for _ in range(WARM_UP_STEPS):
         bench.fast_step()
-    compiled = kernels_compiled(bench)
+    compiled = kernels_compiled(lambda: [bench.fast_step() for _ in range(COUNTED_STEPS)])
     bench.plain_step()
     fast, plain = [], []
     for number in range(max(repeats, plain_repeats)):
@@ -161,14 +140,7 @@ def main() -> None:
         result = measure_memory(bench, options.memory)
     else:
         result = measure(bench, options.repeats, options.plain_repeats)
-    result["machine"] = {
-        "cores": len(os.sched_getaffinity(0)),
-        "torch_threads": torch.get_num_threads(),
-        "drjit_threads": dr.thread_count(),
-        "mitsuba": mi.__version__,
-        "numpy": np.__version__,
-        "torch": torch.__version__,
-    }
+    result["machine"] = machine()
     if options.json:
         print(json.dumps(result, indent=2))
         return

@@ -18,8 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import statistics
 import sys
 import time
@@ -36,8 +34,8 @@ from fd_mitsuba.threads import share_cores  # noqa: E402
 
 share_cores()
 
-import drjit as dr  # noqa: E402
 import torch  # noqa: E402
+from machine import kernels_compiled, machine, resident_mb  # noqa: E402
 from plain_reference import render_plain  # noqa: E402
 
 from fd_mitsuba.config import RunConfig  # noqa: E402
@@ -162,29 +160,12 @@ def breakdown_ms(stage: GeometryStage, runner: Runner, steps: int) -> dict[str, 
     return {name: round(1000 * value / steps, 1) for name, value in result.items()}
 
 
-def kernels_compiled(runner: Runner, steps: int) -> int:
-    """How many kernels Dr.Jit had to compile, or to read from its disk cache, in the next steps."""
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    try:
-        dr.kernel_history_clear()
-        runner.run(steps)
-        return sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
-    finally:
-        dr.set_flag(dr.JitFlag.KernelHistory, False)
-
-
-def resident_mb() -> float:
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 2**20
-
-
 def measure(scene: EditScene, repeats: int, plain_repeats: int) -> dict[str, Any]:
     """The figures of the module's docstring."""
     stage, fine = make_stage(scene, RunConfig().geometry.grid_resolution), make_stage(scene, FINE_RESOLUTION)
     fast = Runner(stage.step)
     fast.run(WARM_UP_STEPS, keep=False)
-    compiled = kernels_compiled(fast, COUNTED_STEPS)
+    compiled = kernels_compiled(lambda: fast.run(COUNTED_STEPS))
     detailed = Runner(fine.step)
     detailed.run(WARM_UP_STEPS, keep=False)
     for _ in range(repeats):
@@ -212,20 +193,6 @@ def measure(scene: EditScene, repeats: int, plain_repeats: int) -> dict[str, Any
         "faces": len(surface.faces),
         "faces_static": stage.extractor.static_faces,
         "active_vertices": len(stage.extractor.active_index),
-    }
-
-
-def machine() -> dict[str, Any]:
-    """What the figures depend on."""
-    cpu = next((line.split(":", 1)[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")), "")
-    return {
-        "cpu": cpu or platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "torch_threads": torch.get_num_threads(),
-        "drjit_threads": dr.thread_count(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "drjit": dr.__version__,
     }
 
 
@@ -268,13 +235,6 @@ def main() -> None:
         return
     for name, value in result.items():
         print(f"{name:20} {value}")
-
-
-def _lines(path: str) -> list[str]:
-    try:
-        return Path(path).read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return []
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +24,7 @@ from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import shape_triangles
+from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.appearance_stage import AppearanceStage
@@ -33,31 +35,71 @@ from fd_mitsuba.training.sheets import map_rows
 
 _SHEET_VIEWS = 8
 _VIDEO_SPP, _SHEET_SPP = 12, 32
+CUTS_UNKNOWN = (
+    "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "
+    "appearance.style=true for faces that go on with the base's material, or guidance.model to a Stable Diffusion model"
+)
 
 
 def parts_of_run(scene: EditScene, folder: Path) -> dict[str, TriangleMesh]:
-    """The parts' meshes that the geometry stage exported, canonical frame.
+    """The parts' meshes that the geometry stage exported, canonical frame; where they are cut out, the cut's faces.
 
     Raises:
         UserError: a part is missing or empty.
     """
     parts = {}
     for name in scene.parts:
-        path = folder / "export" / part_file(name)
+        path = folder / "export" / (f"{cut_faces_name(name)}.ply" if scene.subtracts else part_file(name))
         if not path.is_file():
             raise UserError(f"{path}: missing; run the geometry stage first (--stage geometry)")
-        vertices, faces = shape_triangles(ready_mitsuba(), "ply", {"filename": str(path)}, np.eye(4))
+        vertices, faces = _triangles(path)
         parts[name] = TriangleMesh(name, scene.frame.to_canonical(vertices), faces, (path,))
     return parts
 
 
+def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None:
+    """Where parts are cut out: number of a base shape -> the exported mesh of what is left of it without the faces of
+    the cut; None: nothing. None for scenes that do not cut.
+
+    Raises:
+        UserError: the geometry stage has not been exported, or a file of it is gone.
+    """
+    if not scene.subtracts:
+        return None
+    record = folder / "export" / "part.json"
+    try:
+        names = json.loads(record.read_text(encoding="utf-8"))["opened"]
+        opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
+    except (OSError, ValueError, KeyError):
+        raise UserError(f"{record}: does not say what is left of the base; run the geometry stage anew") from None
+    for path in opened.values():
+        if path is not None and not path.is_file():
+            raise UserError(f"{path}: missing; run the geometry stage anew (--stage geometry)")
+    return opened
+
+
+def _removed(scene: EditScene, folder: Path) -> list[np.ndarray] | None:
+    """Vertices (V, 3) of what was cut out, user frame; None for scenes that do not cut."""
+    paths = [folder / "export" / part_file(name) for name in scene.parts]
+    return [_triangles(path)[0] for path in paths if path.is_file()] if scene.subtracts else None
+
+
+def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    return shape_triangles(ready_mitsuba(), "ply", {"filename": str(path)}, np.eye(4))
+
+
 def prepare_appearance(
-    scene: EditScene, config: RunConfig, say: Callable[[str], None], say_of_prompt: Callable[[str], None]
+    scene: EditScene,
+    config: RunConfig,
+    say: Callable[[str], None],
+    say_of_prompt: Callable[[str], None],
+    shared: DiffusionGuidance | None = None,
 ) -> DiffusionGuidance | None:
     """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
 
     Args:
         say: takes remarks about the scene, `say_of_prompt` those about the prompt's words.
+        shared: the geometry stage's guidance, so that a large model is loaded once.
 
     Raises:
         UserError: see `check_appearance_inputs`, `DiffusionGuidance.load` and `take_prompt`.
@@ -66,7 +108,12 @@ def prepare_appearance(
         say(warning)
     if config.appearance.lambda_sds == 0:
         return None
-    guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
+    if shared is None:
+        guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
+    else:
+        guidance = shared.for_appearance(config.appearance)
+    if guidance.conventions.vocabulary is not None and scene.subtracts:
+        raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt)
     return guidance
 
@@ -87,7 +134,8 @@ def finished_appearance(
     config_hash = config.content_hash(AppearanceStage.name)
     if max_depth is not None:
         config = config.model_copy(update={"appearance": config.appearance.model_copy(update={"max_depth": max_depth})})
-    stage = AppearanceStage(scene, config, parts_of_run(scene, folder), None, lambda line: None)
+    parts, opened = parts_of_run(scene, folder), opened_base(scene, folder)
+    stage = AppearanceStage(scene, config, parts, None, lambda line: None, opened)
     load_trained(folder, stage, config_hash)
     return stage
 
@@ -98,6 +146,9 @@ def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
     alone = AppearancePass(stage.scene, {}, stage.shading, rendering.size, rendering.spp)
     video = lit_turntable(stage, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
     write_video(video, folder / "videos" / "appearance.mp4")
+    around = ring_cameras(output.turntable_frames, stage.aim)
+    before = lit_ring(alone, alone.render_base, around, stage.exposure, output.turntable_size, _VIDEO_SPP)
+    write_video(before, folder / "videos" / "appearance_base.mp4")
     cameras, size = ring_cameras(_SHEET_VIEWS, stage.aim), min(output.turntable_size, 192)
     rows = {
         "base": lit_ring(alone, alone.render_base, cameras, stage.exposure, size, _SHEET_SPP),
@@ -110,7 +161,7 @@ def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
     maps = map_rows(gbuffer, pictures, texture, stage.exposure)
     del maps["merged"]  # at few samples; the result's own row has more
     write_sheet({**rows, **maps}, folder / "images" / "appearance.png")
-    kept = measure_preservation(rendering, alone, cameras, stage.exposure, 128, 16)
+    kept = measure_preservation(rendering, alone, cameras, stage.exposure, 128, 16, _removed(stage.scene, folder))
     return {
         **asdict(kept),
         "exposure": stage.exposure,

@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.edit_scene import EditScene, gap_to_base, share_in_grid
-from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
+from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.triangle_mesh import Topology, topology
 
 THINNEST_IN_CELLS = 3.0
 """A region thinner than this many cells of the grid loses its shape in the marching tetrahedra."""
-
-START_AND_EXPORT_SECONDS = 15.0
-"""What every run takes besides its steps: imports, kernels, meshes, turntable."""
-
-_OPERATIONS = 6e10
-"""Floating-point operations a second of two cores on the networks of Stable Diffusion."""
-
-_REACH = 0.15
-"""How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +44,6 @@ class RegionCheck:
     """Share of the region's volume that the base already fills."""
     volume_cells: float
     thickness_cells: float
-
-
-@dataclass(frozen=True)
-class CostEstimate:
-    """A rough forecast: within a factor of two on a machine like the one of the assumptions."""
-
-    active_vertices: int
-    active_share: float
-    seconds_per_step: float
-    seconds_total: float
-    memory_mb: float
-    assumptions: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -109,9 +88,12 @@ class CheckReport:
             )
         cost = self.cost
         lines.append(
-            f"cost     about {_number(cost.seconds_per_step)} s a step, {_duration(cost.seconds_total)} in all, "
+            f"cost     shape: about {_number(cost.seconds_per_step)} s a step, {_duration(cost.seconds_total)} in all, "
             f"{cost.memory_mb / 1000:.1f} GB of memory; {cost.active_share:.1%} of the grid active"
         )
+        if cost.appearance_seconds_total > 0:
+            step, whole = _number(cost.appearance_seconds_per_step), _duration(cost.appearance_seconds_total)
+            lines.append(f"         material: about {step} s a step, {whole} in all")
         lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
         lines += [f"warning  {warning}" for warning in self.warnings] or ["ok       nothing to warn of"]
         return lines
@@ -161,65 +143,6 @@ def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell:
         volume_cells=region.volume / cell**3,
         thickness_cells=region.thickness / cell,
     )
-
-
-def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
-    """A rough forecast of a geometry run's time and memory, by counting what a step touches.
-
-        step = fixed + field (active vertices) + surface (faces) + rays + guidance (passes of the networks)
-
-    averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
-    them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores, no GPU:
-    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase, peaks of
-    1.1, 1.2 and 1.2 GB; importing, compiling and exporting took 15 s.
-    """
-    geometry, guidance = config.geometry, config.guidance
-    axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
-    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    share = float(np.mean(union_sdf(scene.regions, lattice) > -_REACH))
-    vertices = (geometry.grid_resolution + 1) ** 3
-    active = round(share * vertices)
-
-    queries = active + geometry.focal_samples
-    field = 3.5e-8 * config.field.levels * queries
-    surface = 8e-7 * 8.6 * vertices ** (2 / 3)
-    builtin = guidance.model == "builtin"
-    side = 32 if builtin else 64
-    refined = 1 - geometry.coarse_fraction
-    coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
-    refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
-    weights, source = _unet_weights(guidance.model)
-    passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
-    if builtin:
-        forward, encoder = 0.1 / 4, 0.1 / 4  # four views are one picture to it
-    else:
-        # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
-        forward, encoder = 800.0 * weights / _OPERATIONS, 2.2e12 / _OPERATIONS
-    image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
-    step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
-    assumptions = (
-        "2 cores of about 60 GFLOP/s together, otherwise idle, and views at the size of the latent",
-        f"a UNet of {weights / 1e6:.3g} million weights ({source})",
-        f"{queries} queries of the part's field a step",
-    )
-    memory = 850 + 5e-5 * vertices + 7e-5 * queries * config.field.levels
-    if geometry.lambda_sds > 0:
-        size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
-        memory += 100 + 1.2e-6 * weights * size
-        if not builtin:  # as `guidance.memory` will demand: one call of the UNet, and the encoder's maps for half of it
-            memory += 65 * size * guidance.views_per_call + 3300 * max(1, guidance.views_per_call // 2)
-    return CostEstimate(active, share, step, step * geometry.steps + START_AND_EXPORT_SECONDS, memory, assumptions)
-
-
-def _unet_weights(model: str) -> tuple[float, str]:
-    folder = Path(model) / "unet"
-    files = list(folder.glob("*.safetensors")) or list(folder.glob("*.bin"))
-    if files:
-        size = max(file.stat().st_size for file in files)
-        return size / (2 if ".fp16." in files[0].name else 4), f"from {folder}"
-    if model == "builtin":
-        return 7.0e6, "the built-in prior"
-    return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"
 
 
 def _base_warnings(base: tuple[BaseCheck, ...]) -> list[str]:

@@ -17,9 +17,13 @@ from types import FrameType
 from typing import NoReturn
 
 from fd_mitsuba import __version__
+from fd_mitsuba.cli_ablate import add_ablate_commands
+from fd_mitsuba.cli_batch import add_batch_commands
+from fd_mitsuba.cli_evaluate import add_evaluate_commands
 from fd_mitsuba.cli_export import add_export_commands
 from fd_mitsuba.cli_options import definitions, machine_options, remark, start
 from fd_mitsuba.cli_prior import add_prior_commands
+from fd_mitsuba.cli_report import add_report_commands
 from fd_mitsuba.errors import Interrupted, UserError
 
 
@@ -116,6 +120,10 @@ def _parser() -> argparse.ArgumentParser:
     preview.set_defaults(call=_preview)
 
     add_export_commands(commands)
+    add_batch_commands(commands)
+    add_report_commands(commands)
+    add_evaluate_commands(commands)
+    add_ablate_commands(commands)
 
     doctor = commands.add_parser("doctor", help="what this machine offers: LLVM, Mitsuba, torch, the built-in prior")
     doctor.add_argument("--json", action="store_true")
@@ -142,22 +150,26 @@ def _run(options: argparse.Namespace) -> int:
 
     config = load_config(options.config, options.overrides)
     scene = _load(options)
+    from fd_mitsuba.evaluation.report import reported
     from fd_mitsuba.pipeline import STAGES, run
 
     folder = Path(options.output) if options.output else Path("runs") / Path(options.scene).resolve().parent.name
-    metrics = run(
-        scene,
-        config,
-        folder,
-        resume=options.resume,
-        command=options.command_line,
-        quiet=options.quiet,
-        say=remark,
-        stages=STAGES if options.stage == "all" else (options.stage,),
-        geometry_from=Path(options.geometry_from) if options.geometry_from else None,
-    )
+    with reported(folder, remark):
+        metrics = run(
+            scene,
+            config,
+            folder,
+            resume=options.resume,
+            command=options.command_line,
+            quiet=options.quiet,
+            say=remark,
+            stages=STAGES if options.stage == "all" else (options.stage,),
+            geometry_from=Path(options.geometry_from) if options.geometry_from else None,
+        )
     lit = "appearance" in metrics
-    print(f"{folder}: part in export/, pictures in images/{'appearance' if lit else 'turntable'}.png and videos/")
+    print(
+        f"{folder}: part in export/, pictures in images/{'appearance' if lit else 'turntable'}.png, all in report.html"
+    )
     print(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
         f"base identical: {metrics['base_identical']}, {metrics['seconds']:.0f} s"

@@ -41,7 +41,9 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
     machine_options(render)
     render.set_defaults(call=_render)
 
-    instance = commands.add_parser("instance", help="a Mitsuba scene that shows an exported part in many places")
+    instance = commands.add_parser(
+        "instance", help="a Mitsuba scene and a GLB that show an exported part in many places"
+    )
     instance.add_argument("run", metavar="RUN", help="run folder of which the format mitsuba was exported")
     instance.add_argument("--transforms", required=True, metavar="FILE", help="JSON list of placements")
     instance.add_argument("-o", "--output", metavar="NAME", help="the scene's file name; default: instances.xml")
@@ -105,5 +107,6 @@ def _export(options: argparse.Namespace) -> int:
 def _instance(options: argparse.Namespace) -> int:
     from fd_mitsuba.export.instances import write_instances
 
-    print(write_instances(Path(options.run), Path(options.transforms), options.output or "instances.xml"))
+    for path in write_instances(Path(options.run), Path(options.transforms), options.output or "instances.xml"):
+        print(path)
     return 0

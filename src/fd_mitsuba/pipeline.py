@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 import time
 from collections.abc import Callable, Collection
 from dataclasses import asdict
@@ -12,14 +14,21 @@ import numpy as np
 import torch
 
 from fd_mitsuba import __version__
-from fd_mitsuba.appearance import finished_appearance, parts_of_run, prepare_appearance, write_appearance
+from fd_mitsuba.appearance import (
+    CUTS_UNKNOWN,
+    finished_appearance,
+    opened_base,
+    parts_of_run,
+    prepare_appearance,
+    write_appearance,
+)
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.locality import measure_locality
 from fd_mitsuba.evaluation.turntable import render_ring, write_sheet, write_video
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.cut_shapes import CutBase, cut_base
-from fd_mitsuba.export.meshes import copy_base, write_mesh
+from fd_mitsuba.export.meshes import copy_base, ply_bytes, write_mesh
 from fd_mitsuba.export.part_record import part_file, part_record
 from fd_mitsuba.export.part_solid import part_solid
 from fd_mitsuba.export.solid import LEAST_FACES, Solid
@@ -27,6 +36,7 @@ from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained, write_atomically
@@ -65,11 +75,11 @@ def run(
             first checkpoint leaves no folder behind.
     """
     started = time.monotonic()
-    with_assets = "appearance" in stages
-    if scene.subtracts and with_assets:
+    asked, with_assets = stages, "appearance" in stages
+    if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
         if "geometry" not in stages:
-            raise UserError(f"{scene.path}: its regions subtract, and a cut learns no material; use --stage geometry")
-        say("the regions subtract: only the geometry stage runs, and the cut takes the base's material")
+            raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
+        say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
         stages = ("geometry",)
     with_geometry = "geometry" in stages and geometry_from is None
     check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
@@ -77,7 +87,7 @@ def run(
     guidance = _guidance(scene, config, say) if with_geometry else None
     # Both priors know the same words: what the geometry stage has said of them is not said again.
     listener = (lambda line: None) if guidance is not None else say
-    for_appearance = prepare_appearance(scene, config, say, listener) if "appearance" in stages else None
+    for_appearance = prepare_appearance(scene, config, say, listener, guidance) if "appearance" in stages else None
     if with_geometry:
         geometry = GeometryStage(scene, config, guidance)
         with discarded_without_checkpoint(folder):
@@ -94,17 +104,24 @@ def run(
 
     def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)
+        metrics["peak_memory_mb"] = _peak_memory_mb()
         write_json(folder / "metrics.json", metrics)
 
     write_metrics()
     field = None
     if "appearance" in stages:
-        appearance = AppearanceStage(scene, config, parts_of_run(scene, folder), for_appearance, say)
+        appearance = AppearanceStage(
+            scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
+        )
         run_stage(appearance, folder, resume, quiet, say)
         field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
         write_metrics()
     if with_assets:
         write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+    # Written last of all: a folder without it is not finished.
+    done = {"geometry", *stages}
+    metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}
+    write_metrics()
     return metrics
 
 
@@ -142,16 +159,19 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
         union = stage.surface()
     parts = {name: part_solid(stage, name) for name in scene.parts}
     figures: dict[str, Any] = {}
+    opened = None
     if scene.subtracts:
         cut = _cut(scene, parts)
         figures = cut.figures
-        for name, data in cut.files().items():
+        for name, data in (cut.files() | cut.files(opened=True)).items():
             write_atomically(export / name, data)
-        parts = _removed(scene, cut)
+        for name, mesh in cut.faces.items():
+            write_atomically(export / f"{cut_faces_name(name)}.ply", ply_bytes(mesh.vertices, mesh.faces))
+        parts, opened = _removed(scene, cut), cut.names(opened=True)
     for name, solid in parts.items():
         if len(solid.faces):
             write_mesh(export / part_file(name), solid.vertices, solid.faces, scene)
-    write_json(export / "part.json", part_record(scene, parts))
+    write_json(export / "part.json", part_record(scene, parts, opened))
     write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
     identical = copy_base(scene, export / "base")
     # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
@@ -225,7 +245,8 @@ def write_assets(
     if cut is not None:
         solids = _removed(scene, cut)
     parts = {name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field) for name, solid in solids.items()}
-    write_json(folder / "export" / "part.json", part_record(scene, solids))
+    opened = None if cut is None else cut.names(opened=True)
+    write_json(folder / "export" / "part.json", part_record(scene, solids, opened))
     export = folder / "export"
     return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
 
@@ -245,12 +266,13 @@ def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tenso
         union = stage.surface()
     start = stage.start_surface()
     edited = (union.vertices, union.faces)
-    write_video(
-        render_ring(edited, output.turntable_frames, output.turntable_size, aim), folder / "videos" / "turntable.mp4"
-    )
+    base = (stage.base_surface.vertices, stage.base_surface.faces)
+    for name, mesh in {"turntable": edited, "turntable_base": base, "turntable_part": part}.items():
+        frames = render_ring(mesh, output.turntable_frames, output.turntable_size, aim)
+        write_video(frames, folder / "videos" / f"{name}.mp4")
     size = min(output.turntable_size, 192)
     rows = {
-        "base": render_ring((stage.base_surface.vertices, stage.base_surface.faces), _SHEET_VIEWS, size, aim),
+        "base": render_ring(base, _SHEET_VIEWS, size, aim),
         "base with the focal regions": render_ring((start.vertices, start.faces), _SHEET_VIEWS, size, aim),
         f"result: {stage.scene.prompt}": render_ring(edited, _SHEET_VIEWS, size, aim),
         "part": render_ring(part, _SHEET_VIEWS, size, aim),
@@ -269,3 +291,9 @@ def _guidance(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -
         )
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say)
     return guidance
+
+
+def _peak_memory_mb() -> int:
+    """The most memory that this process has held so far, in units of 2^20 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))

@@ -14,6 +14,7 @@ import trimesh
 from conftest import write_ply
 from PIL import Image
 
+from fd_mitsuba.appearance import render_run
 from fd_mitsuba.cli import main
 from fd_mitsuba.config import load_config
 from fd_mitsuba.errors import UserError
@@ -163,14 +164,73 @@ def test_a_shape_out_of_reach_stays_and_may_be_open(make_scene: Make, tmp_path: 
     assert (folder / "export" / "cut_ball.ply").is_file() and not (folder / "export" / "cut_sheet.ply").exists()
 
 
-def test_the_appearance_stage_is_left_out_with_a_remark(make_scene: Make, ball: str, tmp_path: Path) -> None:
+def test_the_built_in_prior_leaves_the_appearance_stage_out_with_a_remark(
+    make_scene: Make, ball: str, tmp_path: Path
+) -> None:
     scene, said = load_edit_scene(make_scene(base=ball, region=region())), []
     config = load_config(None, [*SETTINGS, "geometry.grid_resolution=20"])
     metrics = run(scene, config, tmp_path / "run", quiet=True, say=said.append)
     assert "appearance" not in metrics and any("only the geometry stage" in line for line in said)
     assert (tmp_path / "run" / "export" / "asset.glb").is_file()
-    with pytest.raises(UserError, match="--stage geometry"):
+    with pytest.raises(UserError, match=r"appearance\.lambda_sds=0"):
         run(scene, config, tmp_path / "run", quiet=True, say=said.append, stages=("appearance",))
+
+
+PAINTED = [
+    "appearance.lambda_sds=0",
+    "appearance.style=true",
+    "appearance.boundary_reach=0.5",
+    "appearance.learning_rate=0.05",
+    "appearance.steps=40",
+    "appearance.views=1",
+    "appearance.spp=2",
+    "appearance.picture_size=16",
+    "output.texture_size=64",
+    "output.sheet_every=1000",
+]
+
+
+@pytest.mark.usefixtures("no_turntable")
+def test_the_faces_of_a_cut_learn_a_material(make_scene: Make, ball: str, tmp_path: Path, mi: Any) -> None:
+    """Without guidance the style losses alone teach it, here on all of it: it takes the ball's paint."""
+    part = '<bsdf type="principled" id="part"><rgb name="base_color" value="0.1, 0.2, 0.6"/></bsdf>'
+    scene, folder = load_edit_scene(make_scene(base=ball, region=region(), part=part)), tmp_path / "run"
+    config = load_config(None, [*SETTINGS, *PAINTED])
+    metrics = run(scene, config, folder, quiet=True, say=lambda line: None)
+    found = metrics["appearance"]
+    assert found["base_psnr_db"] > 60 and found["mask_error"] < 1e-6 and 0 < found["untouched_share"] < 1
+    assert found["mean_red"] > 0.3 > found["mean_blue"]  # from the blue of the scene file to the paint's linear 0.58
+    export = folder / "export"
+    # What is left of the ball and the faces of the cut are the closed cut ball, triangle for triangle.
+    whole, opened = read(mi, export / "cut_ball.ply"), read(mi, export / "open_ball.ply")
+    assert triangles(opened[0][:, :3], opened[1]) <= triangles(whole[0][:, :3], whole[1])
+    faces = trimesh.load(export / "cut_face_bite.ply", process=False)
+    assert len(faces.faces) == len(whole[1]) - len(opened[1]) > 100
+    centre = np.array([5, AWAY, 0])
+    assert np.abs(np.linalg.norm(faces.vertices - centre, axis=1) - BITE).max() < 0.05
+    assert np.all(np.einsum("ij,ij->i", faces.face_normals, centre - faces.triangles_center) > 0)
+    loaded = trimesh.load(export / "asset.glb")
+    assert set(loaded.geometry) == {"base", "cut_face_bite"}
+    texture = loaded.geometry["cut_face_bite"].visual.material.baseColorTexture
+    assert texture.size == (64, 64) and np.asarray(texture)[..., 0].mean() > 1.5 * np.asarray(texture)[..., 2].mean()
+    plain = mi.load_file(str(export / "mitsuba" / "scene.xml"), parallel=False)
+    shapes = {shape.id(): shape for shape in plain.shapes()}
+    assert set(shapes) == {"ball", "cut_face_bite"}
+    assert np.isclose(shapes["ball"].bbox().min.y, -RADIUS, atol=0.01)
+    written = export_run(folder, ("obj", "ply", "glb"), 64, say=lambda line: None)
+    assert {"ply/cut_ball.ply", "ply/cut_face_bite.ply"} <= set(written["files"])
+    pictures = render_run(folder, {}, "round", 1, 32, 4, 3)
+    assert all(path.is_file() for path in pictures)
+    # A next round takes the two for base; another bite needs a closed shape, and says so.
+    exported = export / "mitsuba" / "scene.xml"
+    more = tmp_path / "more.xml"
+    pieces = region("ear", "add", 1.0, -3.2, "ear")
+    more.write_text(f'<scene version="3.0.0">{pieces}</scene>')
+    again = load_edit_scene(exported, regions=more, prompt="a ball with an ear")
+    assert [mesh.name for mesh in again.base] == ["ball", "cut_face_bite"] and not again.earlier
+    more.write_text(f'<scene version="3.0.0">{region("second", y=-AWAY, part="other")}</scene>')
+    with pytest.raises(UserError, match="'ball' is not closed"):
+        load_edit_scene(exported, regions=more, prompt="a ball with two bites")
 
 
 OPEN = '<shape type="ply" id="ball"><string name="filename" value="open.ply"/></shape>'
@@ -187,6 +247,10 @@ CASES = {
     "one part, both modes": ({"region": region() + region("ear", "add")}, ("ear", "'bite'", "one mode")),
     "misses the base": ({"region": region(scale=0.3, y=3.45)}, ("bite", "does not reach the base", "move it")),
     "takes everything": ({"region": region(scale=3.05, y=0)}, ("bite", "all of the base", "shrink")),
+    "a shape with the name of the cut's faces": (
+        {"extra": '<shape type="sphere" id="cut_face_bite"><point name="center" x="5" y="-4" z="0"/></shape>'},
+        ("bite", "'cut_face_bite'", "another part name"),
+    ),
     "open base": ({"base": OPEN}, ("bite", "'ball' is not closed (", "repair")),
     "base inside out": ({"base": OPEN.replace("open", "inward")}, ("bite", "'ball'", "inwards", "flip")),
 }

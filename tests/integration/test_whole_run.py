@@ -155,3 +155,13 @@ def test_without_a_finished_shape(
     error = capfd.readouterr().err
     assert expected in error and "Traceback" not in error
     assert not (place / "nothing").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction"])
+def test_every_variant_runs_both_stages(place: Path, variant: str) -> None:
+    more = ["--set", f"guidance.variant={variant}", "--set", "geometry.steps=3", "--set", "guidance.guidance_scale=7.5"]
+    assert run(place, variant, *more) == 0
+    rows = read_metrics(place / variant / "metrics.jsonl")
+    assert {row["stage"] for row in rows} == {"geometry", "appearance"}
+    assert len(rows) == 6 and all(np.isfinite(row["loss_sds"]) and row["loss_sds"] > 0 for row in rows)

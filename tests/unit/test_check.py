@@ -9,8 +9,9 @@ import pytest
 from conftest import BASE, write_ply
 from PIL import Image
 
-from fd_mitsuba.check import START_AND_EXPORT_SECONDS, check_scene, estimate_cost
+from fd_mitsuba.check import check_scene
 from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig, load_config
+from fd_mitsuba.cost import LIT_PICTURES_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import working_set_bytes
 from fd_mitsuba.preview import preview_scene, region_colours
@@ -122,6 +123,25 @@ def test_cost_of_runs_that_were_measured(more: list[str], seconds: float, megaby
     cost = estimate_cost(scene, load_config(ROOT / "configs" / "quick.toml", more))
     assert cost.seconds_per_step == pytest.approx(seconds, rel=0.3)
     assert cost.memory_mb == pytest.approx(megabytes, rel=0.2)
+
+
+def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
+    scene = load_edit_scene(make_scene())
+    quick = estimate_cost(scene, load_config(ROOT / "configs" / "quick.toml", []))
+    assert quick.appearance_seconds_per_step == pytest.approx(0.4, rel=0.4)  # 0.52 s, with other work on the cores
+    # `benchmarks/appearance_step.py`: 4 views of 128 x 128 pixels, 16 samples, no network.
+    plain = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.picture_size=128"]))
+    assert plain.appearance_seconds_per_step == pytest.approx(0.5, rel=0.2)
+    short = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.steps=200"]))
+    steps = [cost.appearance_seconds_total - LIT_PICTURES_SECONDS for cost in (short, plain)]
+    assert steps[0] == pytest.approx(steps[1] / 10)
+    deep = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.max_depth=6"]))
+    assert deep.appearance_seconds_per_step > 2 * plain.appearance_seconds_per_step
+    lines = check_scene(scene, RunConfig()).lines()
+    assert sum("s a step" in line for line in lines) == 2
+    cut = ball("0.15", 0, 0.3, 0).replace("<transform", '<string name="mode" value="subtract"/><transform')
+    left_out = estimate_cost(load_edit_scene(make_scene(region=cut)), RunConfig())
+    assert left_out.appearance_seconds_total == 0
 
 
 def test_memory_of_stable_diffusion_is_what_loading_it_demands(make_scene: Make) -> None:

@@ -80,7 +80,7 @@ def test_stock_mitsuba_finds_every_copy_where_it_was_put(exported: Path, tmp_pat
         {"part": "hat", "position": [4, 0, 0], "scale": 2, "direction": [0, 1, 0]},
         {"position": [0, -4, 0], "direction": [0, -1, 0]},
     ]
-    path = write_instances(exported, placements(tmp_path, entries), "many.xml")
+    (path,) = write_instances(exported, placements(tmp_path, entries), "many.xml")
     assert "focal_region" not in path.read_text() and "dual_path" not in path.read_text()
     scene = mi.load_file(str(path), parallel=False)
 
@@ -99,7 +99,7 @@ def test_the_base_can_come_along(exported: Path, tmp_path: Path, mi: Any) -> Non
     there = np.eye(4)
     there[0, 3] = 6
     entries = [{"to_world": np.eye(4).tolist(), "base": True}, {"to_world": there.tolist(), "base": True}]
-    path = write_instances(exported, placements(tmp_path, entries), "two.xml")
+    (path,) = write_instances(exported, placements(tmp_path, entries), "two.xml")
     scene = mi.load_file(str(path), parallel=False)
     for x in (0.0, 6.0):
         hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0, 20), mi.Vector3f(0, 0, -1)))
@@ -153,3 +153,13 @@ def test_a_base_that_shines_stays_where_it_is(exported: Path, tmp_path: Path) ->
     with pytest.raises(UserError, match="light"):
         write_instances(exported, placements(tmp_path, [{"position": [0, 0, 0], "base": True}]), "a.xml")
     write_instances(exported, placements(tmp_path, [{"position": [0, 0, 0]}]), "a.xml")
+
+
+def test_the_example_places_a_butterfly_on_many_stumps() -> None:
+    path = Path(__file__).parents[2] / "examples" / "many" / "placements.json"
+    found = read_placements(path, {"parts": {"butterfly": {"anchor": ANCHOR}}})
+    assert len(found) == 7 and [place.base for place in found].count(True) == 6
+    for place in found[:6]:  # turned about y and scaled alike, and standing on the ground at y = 0.9973
+        linear = place.to_world[:3, :3]
+        assert np.allclose(linear.T @ linear, np.eye(3) * linear[1, 1] ** 2, atol=1e-3)
+        assert moved(place.to_world, 0, 0.9973, 0)[1] == pytest.approx(0.9973, abs=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -17,6 +18,8 @@ from fd_mitsuba.scene.views import CameraBatch
 
 MOST_DECIBELS = 200.0
 """What equal pictures are given, so that the figure stays a number in JSON."""
+
+_POINTS_AT_ONCE = 16384
 
 
 @dataclass(frozen=True)
@@ -35,17 +38,25 @@ class BasePreservation:
 
 @torch.no_grad()
 def measure_preservation(
-    with_part: AppearancePass, alone: AppearancePass, cameras: CameraBatch, exposure: float, size: int, spp: int
+    with_part: AppearancePass,
+    alone: AppearancePass,
+    cameras: CameraBatch,
+    exposure: float,
+    size: int,
+    spp: int,
+    solids: Sequence[np.ndarray] | None = None,
 ) -> BasePreservation:
     """Compare the base path with the render of the base alone, at equal seeds.
 
     Args:
         with_part, alone: passes of the same scene, the second without any part.
+        solids: vertices (V, 3), user frame, of what takes or sends light; None: the parts of the first pass. Where
+            parts were cut out, these are what is gone.
     """
     edited, base = (rendering.trace(cameras, 0, size=size, spp=spp) for rendering in (with_part, alone))
     pair = with_part.render_base(edited, 0) * exposure, alone.render_base(base, 0) * exposure
     whole = (edited.base_mask > 0.999) & (base.base_mask > 0.999)
-    touched = light_may_be_touched(with_part, edited)
+    touched = light_may_be_touched(edited, solids or [_vertices(part) for part in with_part.scene.parts])
     counted = (whole & ~touched).expand(-1, 3, -1, -1)
     error = float((pair[0] - pair[1])[counted].square().mean()) if counted.any() else 0.0
     decibels = MOST_DECIBELS if error == 0 else min(-10 * float(np.log10(error)), MOST_DECIBELS)
@@ -54,9 +65,9 @@ def measure_preservation(
     return BasePreservation(decibels, share, float(sides))
 
 
-def light_may_be_touched(rendering: AppearancePass, gbuffer: GBuffer) -> torch.Tensor:
-    """(B, 1, S, S) bool: pixels with a base sample over whose horizon some of a part rises, so that it may take or
-    send light there. Of an opaque base all others are lit as without the part, if light does not bounce."""
+def light_may_be_touched(gbuffer: GBuffer, solids: Sequence[np.ndarray]) -> torch.Tensor:
+    """(B, 1, S, S) bool: pixels with a base sample over whose horizon some of a solid (V, 3) rises, so that it may take
+    or send light there. Of an opaque base all others are lit as without the solids, if light does not bounce."""
     views, size, samples = gbuffer.views.count, gbuffer.views.size, gbuffer.base_samples
     touched = np.zeros(views * size * size, dtype=bool)
     if len(samples):
@@ -64,14 +75,14 @@ def light_may_be_touched(rendering: AppearancePass, gbuffer: GBuffer) -> torch.T
         surface = samples.hit.compute_surface_interaction(ray, mi.RayFlags.All)
         facing = dr.mulsign(mi.Vector3f(surface.n), dr.dot(surface.n, -ray.d))
         points, normals = np.array(surface.p).T.astype(np.float64), np.array(facing).T.astype(np.float64)
-        corners = np.concatenate([_hull(part) for part in rendering.scene.parts])
-        height = np.full(len(points), -np.inf)
-        for corner in corners:
-            np.maximum(height, np.einsum("ij,ij->i", normals, corner - points), out=height)
+        corners = np.concatenate([vertices[ConvexHull(vertices).vertices] for vertices in solids])
+        height = -np.einsum("ij,ij->i", normals, points)
+        for start in range(0, len(points), _POINTS_AT_ONCE):
+            some = slice(start, start + _POINTS_AT_ONCE)
+            height[some] += (normals[some] @ corners.T).max(axis=1)
         touched[np.array(samples.lane)[height > 0] // gbuffer.spp] = True
     return torch.from_numpy(touched).reshape(views, 1, size, size)
 
 
-def _hull(part: mi.Mesh) -> np.ndarray:
-    vertices = np.array(mi.traverse(part)[VERTICES], dtype=np.float64).reshape(-1, 3)
-    return vertices[ConvexHull(vertices).vertices]
+def _vertices(part: mi.Mesh) -> np.ndarray:
+    return np.array(mi.traverse(part)[VERTICES], dtype=np.float64).reshape(-1, 3)

@@ -23,6 +23,7 @@ from fd_mitsuba.export.ready_part import PartAsset, ReadyPart, ready_part
 from fd_mitsuba.export.tangents import vertex_tangents
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
+from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.checkpoint import write_atomically
@@ -53,6 +54,7 @@ def export_assets(
         texture_size: texels a side of each part's textures.
         say: takes remarks, a line each.
         cut: the base without the parts, where these were removed from it: it is written, in place of base and parts.
+            Where the parts have learned materials, these go to the faces of the cut, as meshes of their own.
         face_budget: that the parts were decimated to, for the record.
 
     Parts that `mitsuba/stack.json` in the folder calls hidden or removed are left out of everything.
@@ -66,12 +68,19 @@ def export_assets(
     file = inputs.scene
     states = {part.name: part for part in read_stack(folder / "mitsuba")[0] if part.state != SHOWN}
     absent = {part.shape for part in scene.earlier if part.name in states}
-    whole = base_shapes(scene, file) if cut is None else cut.shapes
+    textured = cut is not None and any(part.values is not None for part in parts.values())
+    whole = base_shapes(scene, file) if cut is None else cut.opened if textured else cut.shapes
     shapes = [shape for shape in whole if shape is not None and shape.name not in absent]
     kept = replace(scene, base=tuple(mesh for mesh in scene.base if mesh.name not in absent))
     identical = copy_base(kept, folder / BASE_NAME, _base_textures(file, absent))
-    added = {name: part for name, part in parts.items() if name not in states} if cut is None else {}
-    ready = [ready_part(scene, config, inputs, name, part, folder, texture_size, say) for name, part in added.items()]
+    if cut is None:
+        added = {f"part_{name}": (name, part) for name, part in parts.items() if name not in states}
+    else:
+        added = {cut_faces_name(name): (name, part) for name, part in _cut_faces(cut, parts).items()}
+    ready = [
+        ready_part(scene, config, inputs, name, label, part, folder, texture_size, say)
+        for label, (name, part) in added.items()
+    ]
     notes = {item.material.name: list(item.material.notes) for item in [*shapes, *ready] if item.material.notes}
     extras = {"prompt": scene.prompt, "seed": config.seed, "version": __version__, "unit": "as in the scene file"}
     written: list[str] = []
@@ -89,7 +98,7 @@ def export_assets(
         for name, source in _earlier_files(kept, cut).items():
             write(f"ply/{name}.ply", source.read_bytes())
         for part in ready:
-            write(f"ply/part_{part.name}.ply", part.ply())
+            write(f"ply/{part.label}.ply", part.ply())
         for name, data in cut.files().items() if cut is not None else ():
             write(f"ply/{name}", data)
     if "mitsuba" in formats:
@@ -126,6 +135,15 @@ def _check(
     probe = folder / ".writable.tmp"
     write_atomically(probe, b"")
     probe.unlink(missing_ok=True)
+
+
+def _cut_faces(cut: CutBase, parts: Mapping[str, PartAsset]) -> dict[str, PartAsset]:
+    """The faces of the cut of every part that has a learned material."""
+    return {
+        name: PartAsset(mesh.vertices, mesh.faces, parts[name].values)
+        for name, mesh in cut.faces.items()
+        if parts[name].values is not None
+    }
 
 
 def shape_name(scene: EditScene, name: str) -> str:
@@ -191,9 +209,10 @@ def _gltf_meshes(
         mesh = part.mesh
         tangents = vertex_tangents(mesh.vertices, mesh.faces, mesh.normals, mesh.uv)
         about = {**extras, "part": part.name}
-        name = f"part_{part.name}"
         meshes.append(
-            GltfMesh(name, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv, tangents, extras=about)
+            GltfMesh(
+                part.label, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv, tangents, extras=about
+            )
         )
     return meshes
 
@@ -206,5 +225,5 @@ def _obj_meshes(scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart
         meshes.append(ObjMesh(name, vertices, faces, shape.material, normals, shape.uv, shape.colours))
     for part in parts:
         mesh = part.mesh
-        meshes.append(ObjMesh(f"part_{part.name}", mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv))
+        meshes.append(ObjMesh(part.label, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv))
     return meshes

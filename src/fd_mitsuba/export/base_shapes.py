@@ -11,6 +11,7 @@ from fd_mitsuba.export.material import PbrMaterial, pbr_material
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.mesh_source import ANALYTIC
 from fd_mitsuba.scene.part_stack import StackedPart
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 
@@ -89,7 +90,7 @@ def _shape(
     mi = file.mi
     plain = {key: value for key, value in element.properties.items() if key != "to_world"}
     loaded = None
-    if element.plugin not in ("sphere", "disk", "cylinder", "rectangle"):
+    if element.plugin not in ANALYTIC:
         with file.searching():
             loaded = mi.load_dict({"type": element.plugin, **plain}, optimize=False)
     parameters = mi.traverse(loaded) if isinstance(loaded, mi.Mesh) else {}

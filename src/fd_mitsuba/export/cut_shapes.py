@@ -2,7 +2,8 @@
 
 Each shape is cut in its own frame, so that a triangle away from the cut keeps every number of its file. A face of the
 cut takes the UV, or the colour, that the base has at the nearest point of its surface: one for the whole face, because
-three of their own may lie on different charts of an atlas.
+three of their own may lie on different charts of an atlas. Where the cut has a learned material, these faces are a mesh
+of their own instead, and the shape is left open.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ class CutBase:
 
     Attributes:
         shapes: what is left of each shape, in the order of the scene; None where nothing is.
+        opened: the same without the faces of the cut; None where no other face is left.
+        faces: name of a part -> the faces that cutting it out has made on all shapes, welded, user frame, seen from
+            where the part was; not closed. Parts that removed nothing are left out.
         is_cut: whether each of them changed.
         removed: name of a part -> what it took away of all shapes, user frame.
         figures: `removed_volume`, cubic user units, shapes that overlap counted one by one; `volume_change_error`,
@@ -38,32 +42,34 @@ class CutBase:
     """
 
     shapes: tuple[BaseShape | None, ...]
+    opened: tuple[BaseShape | None, ...]
+    faces: dict[str, TriangleMesh]
     is_cut: tuple[bool, ...]
     removed: dict[str, Solid]
     figures: dict[str, float]
 
-    def names(self) -> dict[int, str | None]:
-        """Number of a shape that was cut -> the name of its file, None where nothing is left."""
+    def names(self, opened: bool = False) -> dict[int, str | None]:
+        """Number of a shape that was cut -> the name of its file, `open_...` if opened, None where nothing is left."""
         names: dict[int, str | None] = {}
-        for i, (shape, is_cut) in enumerate(zip(self.shapes, self.is_cut, strict=True)):
+        for i, (shape, is_cut) in enumerate(zip(self.opened if opened else self.shapes, self.is_cut, strict=True)):
             if is_cut:
-                name = None if shape is None else cut_file(shape.name)
+                name = None if shape is None else cut_file(shape.name, "open" if opened else "cut")
                 names[i] = f"{i}_{name}" if name is not None and name in names.values() else name
         return names
 
-    def files(self) -> dict[str, bytes]:
+    def files(self, opened: bool = False) -> dict[str, bytes]:
         """File name -> PLY of every shape that was cut and has something left, in the shape's own frame."""
-        names = self.names()
+        names = self.names(opened)
         return {
             name: shape_ply(shape)
-            for i, shape in enumerate(self.shapes)
+            for i, shape in enumerate(self.opened if opened else self.shapes)
             if shape is not None and (name := names.get(i)) is not None
         }
 
 
-def cut_file(name: str) -> str:
+def cut_file(name: str, start: str = "cut") -> str:
     """The file name of a cut shape's mesh."""
-    return "cut_" + re.sub(r"[^\w.-]", "_", name) + ".ply"
+    return f"{start}_" + re.sub(r"[^\w.-]", "_", name) + ".ply"
 
 
 def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> CutBase:
@@ -74,10 +80,12 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
     """
     tools = {name: solid.moved(np.linalg.inv(scene.frame.matrix())) for name, solid in solids.items()}
     tools = {name: tool for name, tool in tools.items() if len(tool.faces)}
-    shapes, is_cut, pieces = [], [], {name: [] for name in tools}
+    shapes, opened, is_cut, pieces = [], [], [], {name: [] for name in tools}
+    faces: dict[str, list[np.ndarray]] = {name: [] for name in tools}
     before = after = removed = 0.0
     for shape, mesh in zip(base_shapes(scene, file), scene.base, strict=True):
         left: BaseShape | None = shape
+        maker = np.full(len(shape.faces), -1)
         near = {name: tool for name, tool in tools.items() if _boxes_meet(tool.vertices, mesh.vertices)}
         if near:
             whole = manifold3d.Manifold(_plain(mesh.vertices, mesh.faces))
@@ -85,11 +93,17 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
                 pieces[name].append(whole ^ _manifold(tool))
             volume = reduce(lambda a, b: a + b, (_manifold(tool) for tool in near.values()))
             removed += (whole ^ volume).volume()
-            for tool in near.values():
-                left = left if left is None else _cut(left, tool.moved(np.linalg.inv(shape.to_world)))
+            for number, tool in enumerate(near.values()):
+                if left is not None:
+                    left, maker = _cut(left, tool.moved(np.linalg.inv(shape.to_world)), maker, number)
             before += _volume(shape)
             after += 0.0 if left is None else _volume(left)
+            for number, name in enumerate(near):
+                if left is not None and (maker == number).any():
+                    vertices, triangles, _ = left.in_user_frame()
+                    faces[name].append(vertices[triangles[maker == number]].astype(np.float32))
         shapes.append(left)
+        opened.append(left if left is None or left is shape else _some_faces(left, maker < 0))
         is_cut.append(left is not shape)
     if not removed > 0:
         raise UserError(f"{scene.path}: nothing was removed from the base; run more steps, or move the region into it")
@@ -97,7 +111,8 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
         raise UserError(f"{scene.path}: nothing is left of the base; shrink the region")
     solids_removed = {name: _solid(found) for name, found in pieces.items()}
     figures = {"removed_volume": before - after, "volume_change_error": abs(before - after - removed) / removed}
-    return CutBase(tuple(shapes), tuple(is_cut), solids_removed, figures)
+    made = {name: _welded(name, np.concatenate(corners)) for name, corners in faces.items() if corners}
+    return CutBase(tuple(shapes), tuple(opened), made, tuple(is_cut), solids_removed, figures)
 
 
 def shape_ply(shape: BaseShape) -> bytes:
@@ -119,16 +134,22 @@ def shape_ply(shape: BaseShape) -> bytes:
     return "\n".join(header).encode("ascii") + data.tobytes() + rows.tobytes()
 
 
-def _cut(shape: BaseShape, tool: Solid) -> BaseShape | None:
-    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left."""
+def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple[BaseShape | None, np.ndarray]:
+    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left.
+
+    Args:
+        maker: (F,) the number of the solid that made each face, -1: none.
+        number: of this solid; the faces that it makes have it in the second value returned.
+    """
     carried = [values for values in (shape.normals, shape.uv, shape.colours) if values is not None]
     empty = np.zeros((len(shape.vertices), 0))
     cut = cut_mesh(shape.name, shape.vertices, shape.faces, np.concatenate([empty, *carried], axis=1), tool)
     if cut.untouched.sum() == len(shape.faces) and len(cut.faces) == len(shape.faces):
-        return shape
+        return shape, maker
     if not len(cut.faces):
-        return None
-    return _assembled(shape, cut)
+        return None, maker[:0]
+    own = cut.source < 0
+    return _assembled(shape, cut), np.concatenate([maker[cut.source[~own]], np.full(int(own.sum()), number)])
 
 
 def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:
@@ -164,6 +185,23 @@ def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:
         start += ours.shape[1]
     faces = np.concatenate([kept.reshape(-1, 3), place.reshape(-1, 3) + len(used)])
     return replace(shape, vertices=vertices, faces=faces, **made)
+
+
+def _some_faces(shape: BaseShape, chosen: np.ndarray) -> BaseShape | None:
+    """The shape with the faces `chosen` (F,) alone and the vertices that these use; None if there are none."""
+    if not chosen.any():
+        return None
+    used, faces = np.unique(shape.faces[chosen], return_inverse=True)
+    rows = {key: getattr(shape, key) for key in ("vertices", "normals", "uv", "colours")}
+    kept = {key: None if values is None else values[used] for key, values in rows.items()}
+    return replace(shape, faces=faces.reshape(-1, 3), **kept)
+
+
+def _welded(name: str, corners: np.ndarray) -> TriangleMesh:
+    """The triangles with corners (F, 3, 3) as a mesh in which equal positions are one vertex; slivers go."""
+    vertices, place = np.unique(corners.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
+    faces = place.reshape(-1, 3)
+    return TriangleMesh(name, vertices, faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)])
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

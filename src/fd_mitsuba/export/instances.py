@@ -1,4 +1,5 @@
-"""An exported part in many places: a stock Mitsuba scene with a shape group per part and an instance per placement.
+"""An exported part in many places: a stock Mitsuba scene with a shape group per part and an instance per placement,
+and the same as GLB.
 
 The file of placements is a JSON list. An entry places a part either by a matrix of the user's frame, applied to the
 part where it grew, or by its anchor, the point and direction with which it sits on the base:
@@ -23,6 +24,7 @@ import numpy as np
 
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.instance_glb import instance_glb
 from fd_mitsuba.training.checkpoint import write_atomically
 
 _KEYS = {"part", "to_world", "position", "direction", "twist_deg", "scale", "base"}
@@ -38,8 +40,10 @@ class Placement:
     base: bool = False
 
 
-def write_instances(run: Path, transforms: Path, name: str) -> Path:
+def write_instances(run: Path, transforms: Path, name: str) -> list[Path]:
     """Write the scene `name` into RUN/export/mitsuba, beside the exported one whose files it uses; returns its path.
+
+    Where there is an `asset.glb`, the same goes beside that as `<name>.glb`, whose path is returned too.
 
     Raises:
         UserError: nothing exported there; a name that is no file name or that of the exported scene; see
@@ -52,11 +56,16 @@ def write_instances(run: Path, transforms: Path, name: str) -> Path:
         exported = scene.read_bytes()
     except (OSError, ValueError):
         raise UserError(f"{scene}: not there, or without part.json; run fd_mitsuba export {run} first") from None
-    if Path(name).name != name or name == scene.name or not name.endswith(".xml"):
+    if Path(name).name != name or name in (scene.name, "asset.xml") or not name.endswith(".xml"):
         raise UserError(f"-o {name}: give a plain file name such as instances.xml; it is written beside {scene}")
-    target = scene.with_name(name)
-    write_atomically(target, instance_scene(exported, read_placements(transforms, record)))
-    return target
+    placements = read_placements(transforms, record)
+    made = {scene.with_name(name): instance_scene(exported, placements)}
+    asset = folder / "asset.glb"
+    if asset.is_file():
+        made[folder / Path(name).with_suffix(".glb")] = instance_glb(asset.read_bytes(), placements)
+    for path, data in made.items():
+        write_atomically(path, data)
+    return list(made)
 
 
 def read_placements(path: Path, record: dict[str, Any]) -> list[Placement]:

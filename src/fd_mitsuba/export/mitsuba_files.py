@@ -29,7 +29,7 @@ def write_mitsuba(
     """Write `mitsuba/scene.xml`, what it reads, and `mitsuba/stack.json`.
 
     Args:
-        parts: without those that are left out.
+        parts: without those that are left out; or the faces of the cut, where they have learned materials.
         write: takes a file's name and bytes.
         cut: the base after a cut.
         states: what is said so far of parts that are left out.
@@ -38,23 +38,22 @@ def write_mitsuba(
     Raises:
         UserError: a file of the scene that is gone.
     """
+    opened = cut is not None and bool(parts)  # the faces of the cut are meshes of their own
     plain = []
     for part in parts:
         textures = {
             parameter: (part.pictures[key].file_name, key == "base_color") for key, parameter in part.feeds.items()
         }
         bent = part.pictures.get("normal_mitsuba")
-        plain.append(
-            MitsubaPart(part.name, f"part_{part.name}.ply", textures, bent.file_name if bent is not None else "")
-        )
+        plain.append(MitsubaPart(part.label, f"{part.label}.ply", textures, bent.file_name if bent is not None else ""))
     data, copies = mitsuba_scene(
         scene,
         inputs,
         plain,
-        None if cut is None else cut.names(),
+        None if cut is None else cut.names(opened),
         [part.shape for part in scene.earlier if part.name in states],
     )
-    for name, mesh in cut.files().items() if cut is not None else ():
+    for name, mesh in cut.files(opened).items() if cut is not None else ():
         write(f"mitsuba/{FILES}/{name}", mesh)
     normals = {part.name: part.normal_path(scene.path.parent) for part in scene.earlier if part.name not in states}
     copies |= {path.name: path for path in normals.values() if path is not None}
@@ -97,7 +96,8 @@ def _stack(
         elif part.name in states:
             found.append(states[part.name])
     latest = 1 + max((part.round for part in scene.earlier), default=0)
-    ready = {part.name: part for part in parts}
+    # The faces of a cut are no part: nothing could be hidden, and a next round takes them for base.
+    ready = {part.name: part for part in parts if part.label == f"part_{part.name}"}
     for name in scene.parts:
         if name in ready:
             part = ready[name]

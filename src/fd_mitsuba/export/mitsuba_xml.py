@@ -15,13 +15,13 @@ from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.mesh_source import ANALYTIC
 from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION
 from fd_mitsuba.scene.scene_file import SceneFile
 
 FILES = "files"
 """Folder beside the scene that holds what it reads."""
 
-_ANALYTIC = ("sphere", "disk", "cylinder", "rectangle")
 _WRAPPERS = ("twosided", "mask", "normalmap", "bumpmap")
 
 
@@ -30,13 +30,13 @@ class MitsubaPart:
     """A part in the scene.
 
     Attributes:
-        name: of the part.
+        label: the shape's id, `part_<name>` or `cut_face_<name>`.
         ply: name of its PLY in the folder `FILES`, UVs with the origin bottom left.
         textures: parameter of the part's BSDF -> picture in `FILES`, and whether it holds sRGB.
         normal_map: picture in `FILES`, or "".
     """
 
-    name: str
+    label: str
     ply: str
     textures: dict[str, tuple[str, bool]] = field(default_factory=dict)
     normal_map: str = ""
@@ -170,7 +170,7 @@ class _Names:
 def _put_cut_mesh(shape: ET.Element, ply: str) -> None:
     """Let a base shape read its cut mesh: placed as before if it was a mesh, where it stands if it was analytic."""
     kept = {"bsdf", "ref", "medium"}
-    named = {"face_normals"} if shape.get("type") in _ANALYTIC else {"face_normals", "to_world"}
+    named = {"face_normals"} if shape.get("type") in ANALYTIC else {"face_normals", "to_world"}
     for child in list(shape):
         if child.tag not in kept and child.get("name") not in named:
             shape.remove(child)
@@ -179,7 +179,7 @@ def _put_cut_mesh(shape: ET.Element, ply: str) -> None:
 
 
 def _part(part: MitsubaPart, bsdf: ET.Element) -> ET.Element:
-    shape = ET.Element("shape", {"type": "ply", "id": f"part_{part.name}"})
+    shape = ET.Element("shape", {"type": "ply", "id": part.label})
     _put(shape, "string", "filename", f"{FILES}/{part.ply}")
     _put(shape, "boolean", "flip_tex_coords", "true")
     bsdf = copy.deepcopy(bsdf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fd_mitsuba.export.solid import Solid
@@ -12,12 +14,16 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 RECORD_FORMAT = 1
 
 
-def part_record(scene: EditScene, solids: dict[str, Solid]) -> dict:
+def part_record(scene: EditScene, solids: dict[str, Solid], opened: Mapping[int, str | None] | None = None) -> dict:
     """Plain data for JSON about the parts' solids, which are given in the canonical frame.
 
     `canonical_to_user` is the (4, 4) matrix between the frames. For each part: `file`, the PLY in the user's frame;
     `bounds` and `anchor`, both in the user's frame and unit; `volume` in cubic user units; `gap` and `bridged` in the
     user's unit; `faces`, `manifold`, `islands_removed`. A part without faces is left out.
+
+    Args:
+        opened: where parts were cut out: number of a base shape that was cut -> file of what is left of it without the
+            faces of the cut; None: nothing is.
     """
     base, scale = scene.base_canonical, 1.0 / scene.frame.scale
     distance = MeshDistance(base.vertices, base.faces)
@@ -39,7 +45,10 @@ def part_record(scene: EditScene, solids: dict[str, Solid]) -> dict:
             "islands_removed": solid.islands_removed,
         }
     to_user = np.linalg.inv(scene.frame.matrix())
-    return {"format": RECORD_FORMAT, "canonical_to_user": to_user.tolist(), "parts": parts}
+    record = {"format": RECORD_FORMAT, "canonical_to_user": to_user.tolist(), "parts": parts}
+    if opened is not None:
+        record["opened"] = {str(number): name for number, name in opened.items()}
+    return record
 
 
 def part_file(name: str) -> str:

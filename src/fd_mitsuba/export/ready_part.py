@@ -26,7 +26,7 @@ class PartAsset:
 
     Attributes:
         vertices: (V, 3), user frame.
-        faces: (F, 3), a closed solid.
+        faces: (F, 3), a closed solid, or the faces of a cut.
         values: the learned material; None: the constants of the scene's `<bsdf id="part">`.
     """
 
@@ -40,6 +40,8 @@ class ReadyPart:
     """What the writers need of a part."""
 
     name: str
+    label: str
+    """What it is called in files, nodes and groups: `part_<name>`, or `cut_face_<name>`."""
     mesh: UnwrappedMesh
     material: PbrMaterial
     pictures: dict[str, Picture]
@@ -56,6 +58,7 @@ def ready_part(
     config: RunConfig,
     inputs: EditInputs,
     name: str,
+    label: str,
     part: PartAsset,
     folder: Path,
     texture_size: int,
@@ -67,19 +70,19 @@ def ready_part(
     """
     mesh = unwrap(part.vertices, part.faces, texture_size)
     file, element = inputs.part_bsdf()
-    plain = PbrMaterial(f"part_{name}") if element is None else pbr_material(file, element, f"part_{name}")
+    plain = PbrMaterial(label) if element is None else pbr_material(file, element, label)
     if part.values is None:
-        return ReadyPart(name, mesh, plain, {}, {})
+        return ReadyPart(name, label, mesh, plain, {}, {})
     say(f"baking the textures of {name}, {texture_size} x {texture_size}")
     canonical = replace(mesh, vertices=scene.frame.to_canonical(mesh.vertices))
     textures = bake(canonical, part.values, texture_size)
-    pictures = part_pictures(f"part_{name}", textures)
+    pictures = part_pictures(label, textures)
     fed = part_material(scene, config.appearance.fixed, config.appearance.normal_map)
     feeds = {}
     for channel, path in fed.feeds.items():
         feeds[channel] = path.rpartition(".")[2]
         if channel in fed.squared:
-            alpha = Picture(f"part_{name}_alpha", png(textures.roughness**2), wrap="clamp")
+            alpha = Picture(f"{label}_alpha", png(textures.roughness**2), wrap="clamp")
             pictures["alpha"], feeds["alpha"] = alpha, feeds.pop(channel)
     for key, picture in pictures.items():
         write_atomically(folder / "textures" / picture.file_name, picture.data)
@@ -92,7 +95,7 @@ def ready_part(
         orm_picture=pictures["orm"],
         normal_picture=pictures.get("normal"),
     )
-    return ReadyPart(name, mesh, material, pictures, feeds)
+    return ReadyPart(name, label, mesh, material, pictures, feeds)
 
 
 def _factor(plain: PbrMaterial, fed: PartMaterial) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from fd_mitsuba.threads import network_threads
 
 UNSEEN_SEED = 2**31
 """Bodies and parts of the evaluation come from seeds from here on; training draws its own below."""
-_KEPT_WITHIN = 0.15
+KEPT_WITHIN = 0.15
 _KEPT_SHARE = 0.95
 
 
@@ -74,9 +75,7 @@ def evaluate(
     Raises:
         UserError: a name outside the vocabulary.
     """
-    for name, known in [*((body, BODIES) for body in bodies), *((part, PARTS) for part in parts)]:
-        if name not in known:
-            raise UserError(f"{name!r}: no such name; known: {', '.join(known)}")
+    check_names(bodies, parts)
     guidance = DiffusionGuidance.load(GuidanceConfig(model=str(folder), views_per_call=16))
     rows, judged = [], []
     for number, body in enumerate(bodies):
@@ -85,8 +84,8 @@ def evaluate(
         sampled = draw_samples(guidance, base, [pair.caption for pair in pairs], seed * 100 + number, steps)
         judged += [_judge(pair, latent.numpy()) for pair, latent in zip(pairs, sampled, strict=True)]
         order = sorted(range(len(pairs)), key=lambda i: pairs[i].closeup)
-        truth = np.concatenate([_colours(pairs[i].edited / 127.0) for i in order], axis=1)
-        drawn = np.concatenate([_colours(sampled[i].numpy()) for i in order], axis=1)
+        truth = np.concatenate([picture(pairs[i].edited / 127.0) for i in order], axis=1)
+        drawn = np.concatenate([picture(sampled[i].numpy()) for i in order], axis=1)
         rows += [truth, drawn]
     output.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(rows)).save(output)
@@ -102,13 +101,42 @@ def evaluate(
 
 def _judge(pair: Pair, sample: np.ndarray) -> tuple[str | None, str, tuple[float, float]]:
     base, truth = pair.base / 127.0, pair.edited / 127.0
-    changed, wanted = (np.abs(picture - base).max(0) > 2 * _KEPT_WITHIN for picture in (sample, truth))
-    body = (base[3] > -0.5) & ~wanted
-    kept = (np.abs(sample - base).max(0) < _KEPT_WITHIN)[body].mean() > _KEPT_SHARE if body.any() else True
-    union = (changed | wanted).sum()
+    changed, wanted = (_differs(latent, base) for latent in (sample, truth))
+    union, kept = (changed | wanted).sum(), keeps_body(base, truth, sample)
     return pair.part, pair.body, (float(kept), float((changed & wanted).sum() / union) if union else 1.0)
 
 
-def _colours(latent: np.ndarray) -> np.ndarray:
+def check_names(bodies: Sequence[str], parts: Sequence[str]) -> None:
+    """UserError for a name outside the vocabulary."""
+    for name, known in [*((body, BODIES) for body in bodies), *((part, PARTS) for part in parts)]:
+        if name not in known:
+            raise UserError(f"{name!r}: no such name; known: {', '.join(known)}")
+
+
+def keeps_body(base: np.ndarray, truth: np.ndarray, sample: np.ndarray, within: float = KEPT_WITHIN) -> bool:
+    """Whether at least 95 % of the body's pixels that the true part leaves alone are as they were.
+
+    Args:
+        base, truth, sample: latents (4, H, W): the body, the body with the part, and what was drawn.
+        within: how far the largest channel may be off.
+    """
+    body = body_pixels(base, truth)
+    return bool((np.abs(sample - base).max(0) < within)[body].mean() > _KEPT_SHARE) if body.any() else True
+
+
+def body_pixels(base: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Where (H, W) the body is and the true part is not."""
+    return (base[3] > -0.5) & ~_differs(truth, base)
+
+
+def _differs(latent: np.ndarray, base: np.ndarray) -> np.ndarray:
+    return np.abs(latent - base).max(0) > 2 * KEPT_WITHIN
+
+
+def picture(latent: np.ndarray) -> np.ndarray:
+    """Colours (H, W, 3) uint8 of a geometry latent (4, H, W), on black."""
     mask = (latent[3:] + 1) / 2
     return (np.clip((latent[:3] + mask) / 2, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
+
+
+_colours = picture

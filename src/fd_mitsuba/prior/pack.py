@@ -1,4 +1,4 @@
-"""From a training checkpoint to the pipeline folder that ships: fp16 safetensors in Diffusers layout, with hashes."""
+"""From a training checkpoint to the folder that ships: fp16 safetensors in Diffusers' layout, with hashes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ import diffusers
 import torch
 
 from fd_mitsuba.guidance.builtin import SUMS_NAME
+from fd_mitsuba.prior import clip_train
 from fd_mitsuba.prior.kinds import GEOMETRY, kind_named
 from fd_mitsuba.prior.model import build_scheduler, build_tokenizer
 
 
 def pack(checkpoint: Path, folder: Path) -> None:
-    """Write the averaged weights of a checkpoint as an InstructPix2Pix-layout pipeline folder.
+    """Write the averaged weights of a checkpoint as an InstructPix2Pix-layout pipeline, an evaluator's as a CLIP model.
 
     Args:
-        checkpoint: `checkpoint.pt` of `prior.train.train`; it says which kind of prior it is.
+        checkpoint: `checkpoint.pt` of `prior.train.train` or `clip_train.train_evaluator`; it says which kind it is.
         folder: created; existing files are replaced.
     """
     state = torch.load(checkpoint, weights_only=True)
+    if state.get("kind") == clip_train.KIND:
+        clip_train.pack_evaluator(state, folder)
+        return
     kind, tokenizer = kind_named(state.get("kind", GEOMETRY.name)), build_tokenizer()
     modules = kind.build_modules(tokenizer)
     missing = modules.load_state_dict(state["average"], strict=False).missing_keys

@@ -6,7 +6,9 @@ import json
 import os
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -28,6 +30,29 @@ THIN = ("horn", "handle", "skateboard", "glasses", "antlers")
 """Parts of few pixels, drawn twice as often as the others."""
 
 
+def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
+    """The pairs of one random body with four of its parts, and now and then of the body alone; none of `HELD_OUT`."""
+    body = str(rng.choice(list(BODIES), p=_BODY_SHARES))
+    allowed = [part for part in PARTS if (body, part) not in HELD_OUT]
+    shares = np.array([2.0 if part in THIN else 1.0 for part in allowed])
+    drawn = rng.choice(len(allowed), size=4, replace=False, p=shares / shares.sum())
+    parts: list[str | None] = [allowed[i] for i in drawn]
+    if rng.random() < 0.15:
+        parts.append(None)
+    return kind.make_pairs(body, parts, int(rng.integers(2**31)))
+
+
+class Pairs(Protocol):
+    """Where the training's batches come from: rendered as they are needed (`Pool`), or `dataset.StoredPairs`."""
+
+    def refresh(self, count: int) -> None:
+        """Bring `count` more pairs in, if that is how it works."""
+
+    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
+        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
+        ...
+
+
 class Pool:
     """The most recent pairs; every call to `refresh` renders one more body with a few of its parts."""
 
@@ -40,14 +65,7 @@ class Pool:
         """Render until `count` more pairs are there; what a body gives beyond that counts for the next call."""
         self._owed += count
         while self._owed > 0:
-            body = str(self._rng.choice(list(BODIES), p=_BODY_SHARES))
-            allowed = [part for part in PARTS if (body, part) not in HELD_OUT]
-            shares = np.array([2.0 if part in THIN else 1.0 for part in allowed])
-            drawn = self._rng.choice(len(allowed), size=4, replace=False, p=shares / shares.sum())
-            parts: list[str | None] = [allowed[i] for i in drawn]
-            if self._rng.random() < 0.15:
-                parts.append(None)
-            made = self._kind.make_pairs(body, parts, int(self._rng.integers(2**31)))
+            made = draw_pairs(self._kind, self._rng)
             self._pairs.extend(made)
             self._owed -= len(made)
 
@@ -69,6 +87,7 @@ def train(
     total_steps: int = 5000,
     seed: int = 0,
     init: Path | None = None,
+    pairs: Pairs | None = None,
 ) -> None:
     """Train until `total_steps` or for `seconds`, whichever is first; continue from `folder` if it holds a checkpoint.
 
@@ -76,6 +95,7 @@ def train(
         folder: checkpoints and log; written every five minutes and at the end.
         kind: which prior.
         init: optional folder of packed weights to start from instead of random ones.
+        pairs: what to train on instead of freshly rendered pictures.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
@@ -102,7 +122,7 @@ def train(
         average, step = state["average"], state["step"]
     alphas = scheduler.alphas_cumprod
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    pool = Pool(kind, seed * 7919 + step)
+    pool = Pool(kind, seed * 7919 + step) if pairs is None else pairs
     pool.refresh(min(600, total_steps * batch_size))
     started, saved, smooth = time.time(), time.time(), None
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -57,13 +58,14 @@ class AppearancePass:
 
     Args:
         scene: whose base shapes, BSDFs, textures and emitters are used as they are.
-        parts: name -> closed mesh in the canonical frame. None at all gives the base alone.
+        parts: name -> mesh in the canonical frame, closed or the faces of a cut. None at all gives the base alone.
         shading: the parts' BSDF and which fields feed it.
         size: pictures are `size` x `size` pixels.
         spp: samples a pixel.
         max_depth: as of Mitsuba's `path`: 2 is direct light with shadows; more adds bounces; -1 leaves the end to
             chance. Bounces see the part with the values of `set_vertex_values` and without its perturbed normals.
         deferred_base: the ablation with a single path: the field shades the base as well.
+        opened: the base after a cut, whose faces are the parts; see `AppearanceScene.build`.
 
     Raises:
         UserError: the scene has no emitter, or one with values that are not finite.
@@ -79,13 +81,14 @@ class AppearancePass:
         spp: int = 16,
         max_depth: int = 2,
         deferred_base: bool = False,
+        opened: Mapping[int, Path | None] | None = None,
     ) -> None:
         if size < 2 or spp < 1 or (max_depth < 2 and max_depth != -1):
             raise ValueError(f"size = {size}, spp = {spp}, max_depth = {max_depth}: at least 2, 1, and 2 or -1")
         self.size, self.spp, self.deferred_base = size, spp, deferred_base
         self.part_names = tuple(parts)
         self._frame = scene.frame
-        self.scene = AppearanceScene.build(scene, parts, shading, bounces=max_depth != 2)
+        self.scene = AppearanceScene.build(scene, parts, shading, max_depth != 2, opened)
         self._transport = LightTransport(self.scene.lit, max_depth)
         self._shading = FilmShading(shading)
         self._clay = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import drjit as dr
@@ -14,13 +15,14 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
 from fd_mitsuba.render.upload import upload_floats, upload_indices
-from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.mesh_source import ANALYTIC
 
 _NOT_RENDERED = ("focal_region", "sensor", "integrator")
 
 
 class Triangles(Protocol):
-    """A closed mesh, canonical frame, outward faces."""
+    """A mesh, canonical frame, outward faces: a closed part, or the faces of a cut."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -44,12 +46,18 @@ class AppearanceScene:
 
     @classmethod
     def build(
-        cls, scene: EditScene, parts: Mapping[str, Triangles], shading: PartShading, bounces: bool
+        cls,
+        scene: EditScene,
+        parts: Mapping[str, Triangles],
+        shading: PartShading,
+        bounces: bool,
+        opened: Mapping[int, Path | None] | None = None,
     ) -> AppearanceScene:
         """Load the scene file once more and put the parts into it.
 
         Args:
             bounces: whether light may go on from a part's surface; if not, nobody asks for its BSDF there.
+            opened: number of a base shape -> the mesh that takes its place after a cut, None: nothing does.
 
         Raises:
             UserError: the scene has no emitter, or an emitter holds values that are not finite.
@@ -64,7 +72,7 @@ class AppearanceScene:
             _check_emitter(scene, emitter)
         meshes = tuple(_part_mesh(name, solid, scene, shading if bounces else None) for name, solid in parts.items())
         lamps = [shape for shape in loaded.shapes() if shape.is_emitter()]
-        base = [shape for shape in loaded.shapes() if not shape.is_emitter()]
+        base = _opened(scene, [shape for shape in loaded.shapes() if not shape.is_emitter()], opened or {})
         # A light with a shape comes along with that shape.
         lights = [light for light in loaded.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Surface)]
         lit = _scene([*base, *meshes, *lamps, *lights])
@@ -87,6 +95,24 @@ class AppearanceScene:
 def _scene(objects: list[Any]) -> mi.Scene:
     content = {f"object_{number}": value for number, value in enumerate(objects)}
     return mi.load_dict({"type": "scene", **content}, optimize=False, parallel=False)
+
+
+def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | None]) -> list[Any]:
+    """The base's shapes, those that were cut with what is left of their triangles; BSDFs and places stay."""
+    if not opened:
+        return shapes
+    left = []
+    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs().scene), strict=True)):
+        path = opened.get(number)
+        if path is None:
+            left += [shape] * (number not in opened)
+            continue
+        description = {"type": "ply", "filename": str(path), "bsdf": shape.bsdf()}
+        if element.plugin not in ANALYTIC:  # of these the file is in the user's frame
+            names = ("to_world", "face_normals")
+            description |= {name: element.properties[name] for name in names if name in element.properties}
+        left.append(mi.load_dict(description, optimize=False))
+    return left
 
 
 def _part_mesh(name: str, solid: Triangles, scene: EditScene, shading: PartShading | None) -> mi.Mesh:

@@ -12,6 +12,9 @@ from fd_mitsuba.scene.tessellate import Arrays, tube, unit_disk, unit_sphere
 FILE_SHAPES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
 """Mitsuba's plugin for a mesh file's suffix."""
 
+ANALYTIC = ("sphere", "disk", "cylinder", "rectangle")
+"""Shapes without a file, whose triangles are made here."""
+
 
 class NotAMesh(Exception):
     """The shape has no triangles and no tessellation here."""

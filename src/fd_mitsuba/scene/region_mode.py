@@ -22,6 +22,11 @@ def region_mode(element: SceneElement) -> str:
     return str(mode)
 
 
+def cut_faces_name(part: str) -> str:
+    """What the faces are called that cutting a part out makes: as a shape, in files, nodes and groups."""
+    return f"cut_face_{part}"
+
+
 def check_modes(
     elements: list[SceneElement],
     regions: tuple[FocalRegion, ...],
@@ -37,8 +42,8 @@ def check_modes(
         gaps: distance between each region and the base, 0 where they overlap.
 
     Raises:
-        UserError: adding and subtracting in one scene; a cut that misses the base, takes all of it, or comes near a
-            mesh that encloses nothing.
+        UserError: adding and subtracting in one scene; a cut that misses the base, takes all of it, comes near a mesh
+            that encloses nothing, or whose faces would have the name of a base shape.
     """
     for element, region, gap in zip(elements, regions, gaps, strict=True):
         if region.mode != regions[0].mode:
@@ -48,6 +53,11 @@ def check_modes(
             raise element.error(f"{both}; give all regions one mode, and edit in two runs")
         if region.mode == SUBTRACT and gap > 0:
             raise element.error("does not reach the base, so nothing can be cut out; move it into the base")
+        taken = {mesh.name.lower(): mesh.name for mesh in base}
+        if region.mode == SUBTRACT and (clash := taken.get(cut_faces_name(region.part).lower())):
+            raise element.error(
+                f"cutting out part {region.part!r} makes a second shape {clash!r}; give another part name"
+            )
     if regions[0].mode != SUBTRACT:
         return
     left = False

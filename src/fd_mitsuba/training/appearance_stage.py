@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -64,9 +65,11 @@ class AppearanceStage:
     Args:
         scene: what to edit; its emitters light it.
         config: how.
-        parts: name -> closed mesh of the part, canonical frame, as the geometry stage left it.
+        parts: name -> closed mesh of the part, canonical frame, as the geometry stage left it; where parts are cut out,
+            the faces of the cut.
         guidance: the source of the image loss; its prompt must be set. None leaves the image loss out.
         say: takes remarks for the user, a line each.
+        opened: the base after a cut; see `AppearanceScene.build`.
 
     Raises:
         UserError: no light, a part material without anything to learn, views that do not fill the model's mosaic.
@@ -81,6 +84,7 @@ class AppearanceStage:
         parts: Mapping[str, Triangles],
         guidance: AppearanceGuidance | None,
         say: Callable[[str], None] = print,
+        opened: Mapping[int, Path | None] | None = None,
     ) -> None:
         settings = config.appearance
         check_views(self.name, config, guidance)
@@ -95,7 +99,7 @@ class AppearanceStage:
         size = settings.picture_size or (guidance.appearance_size if guidance is not None else 128)
         self.shading = PartShading.of(self.material)
         self.rendering = AppearancePass(
-            scene, self.parts, self.shading, size, settings.spp, settings.max_depth, settings.single_path
+            scene, self.parts, self.shading, size, settings.spp, settings.max_depth, settings.single_path, opened
         )
         corners = np.concatenate([np.asarray(mesh.vertices) for mesh in self.parts.values()])
         self.focus = bounding_ball(corners)

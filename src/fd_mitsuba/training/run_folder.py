@@ -20,7 +20,7 @@ from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.training.checkpoint import is_litter, list_checkpoints, write_atomically
 
 _IDENTITY_NAME, _SETTINGS_NAME = "run.json", "config.json"
-_FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", _IDENTITY_NAME)
+_FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", "report.html", _IDENTITY_NAME)
 _FOLDERS = ("scene", "images", "checkpoints")
 
 
@@ -95,7 +95,7 @@ def write_json(path: Path, data: dict) -> None:
 
 
 def identity(scene: EditScene, config: RunConfig) -> dict:
-    """What `run.json` holds: the scene by path and content, prompt, `-D` parameters, the settings' hash."""
+    """What `run.json` holds: the scene by path and content, prompts, `-D` parameters, the settings' hash."""
     digest = hashlib.sha256()
     for file in scene.files:
         data = Path(file).read_bytes()
@@ -104,6 +104,7 @@ def identity(scene: EditScene, config: RunConfig) -> dict:
         "scene": str(scene.path.resolve()),
         "scene_hash": digest.hexdigest()[:16],
         "prompt": scene.prompt,
+        "base_prompt": scene.base_prompt,
         "regions": None if scene.regions_path is None else str(scene.regions_path.resolve()),
         "parameters": scene.regions_parameters | scene.parameters,
         "config_hash": config.content_hash(),

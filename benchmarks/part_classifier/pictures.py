@@ -1,0 +1,143 @@
+"""What the judge of parts is trained on: views of distorted bodies before and after a distorted part was added."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fd_mitsuba.conventions import BASE_LONGEST_SIDE
+from fd_mitsuba.prior.bodies import BODIES
+from fd_mitsuba.prior.corpus import MosaicCamera, RayCaster, closeup_camera, shade, vertex_normals
+from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.primitives import Solid, ellipsoid, join, rotation
+
+SEEN_SEED = 2**33
+"""Training draws from here on, far from the prior's seeds (below 2**31), its evaluation's and the CLIP evaluator's."""
+UNSEEN_SEED = 2**34
+CLOSEUP_SHARE = 0.25
+BLOB_SHARE = 0.35
+"""Parts that are also shown as the ellipsoids that a run would start from, which are no part."""
+LEAST_PIXELS = 5.0
+"""Views in which less than so many pixels change show no part."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Int8 views (N, 4, 32, 32) in units of 1/127 before and after, and what was added: an index into the classes.
+
+    `closeup` (N,) tells views centred on the part, `blob` (N,) those with ellipsoids in its place.
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+    label: np.ndarray
+    body: np.ndarray
+    closeup: np.ndarray
+    blob: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def make_views(body: str, seed: int) -> Views:
+    """Four views of every part on one random body and of the body alone, deterministic in (body, seed)."""
+    number = list(BODIES).index(body)
+    rng = np.random.default_rng([seed, number])
+    made = BODIES[body](rng)
+    warp = _Warp(made.solid, rng)
+    base = warp(made.solid)
+    base_caster, camera = RayCaster(base), _overview(rng)
+    rays = camera.rays()
+    hits = base_caster.cast(*rays[:2])
+    rows: list[tuple] = []
+
+    def see(solid: Solid, label: int, closeup: bool, blob: bool) -> None:
+        at, seen, found = camera, rays, hits
+        if closeup:
+            at = closeup_camera(solid, rng)
+            seen = at.rays()
+            found = base_caster.cast(*seen[:2])
+        before = _views(shade(*found, seen[2]))
+        distance, normal = RayCaster(solid).cast(*seen[:2])
+        nearer = distance < found[0]
+        merged = np.where(nearer, distance, found[0]), np.where(nearer[:, None], normal, found[1])
+        after = _views(shade(*merged, seen[2]))
+        for one, two in zip(before, after, strict=True):
+            if changed_pixels(one / 127.0, two / 127.0) >= LEAST_PIXELS:
+                rows.append((one, two, label, number, closeup, blob))
+
+    for label, part in enumerate(PARTS):
+        original = PARTS[part](made, rng)
+        solid = warp(_distorted(original, rng))
+        closeup = bool(rng.random() < CLOSEUP_SHARE)
+        see(solid, label, closeup, False)
+        if rng.random() < BLOB_SHARE:
+            see(warp(blobs_of(original, rng)), len(PARTS), closeup, True)
+    alone = _views(shade(*hits, rays[2]))
+    rows += [(view, view, len(PARTS), number, False, False) for view in alone]
+    return Views(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def changed_pixels(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """How many pixels of views (..., 4, H, W) differ, soft ones counted in part."""
+    return np.clip(np.abs(after - before).max(-3) / 0.3, 0, 1).sum((-2, -1))
+
+
+def blobs_of(part: Solid, rng: np.random.Generator) -> Solid:
+    """One ellipsoid in a part's bounding box, or two where it is in two halves with a gap or often otherwise."""
+    points = part.vertices
+    low, high = points.min(0), points.max(0)
+    between = np.abs(points[:, 0]).min() > 0.02 or (high[0] - low[0] > 0.8 and rng.random() < 0.5)
+    groups = [points[points[:, 0] > 0], points[points[:, 0] <= 0]] if between and low[0] < -0.02 else [points]
+    solids = []
+    for group in (g for g in groups if len(g)):
+        centre, half = (group.min(0) + group.max(0)) / 2, np.ptp(group, axis=0) / 2
+        half = np.maximum(half * rng.uniform(0.7, 1.15, 3), 0.05)
+        solids.append(ellipsoid(centre, half, rotation(*rng.uniform(-12, 12, 3))))
+    return join(solids)
+
+
+class _Warp:
+    """A smooth bend, other proportions and a slight turn, the same for a body and its part; canonical frame after."""
+
+    def __init__(self, body: Solid, rng: np.random.Generator) -> None:
+        turn = rotation(*rng.uniform([-4, -10, -3], [4, 10, 3]))
+        self._linear = turn @ np.diag(rng.uniform(0.85, 1.15, 3))
+        self._waves, self._phases = rng.normal(size=(3, 3)) * 1.5, rng.uniform(0, 2 * np.pi, 3)
+        self._shifts = rng.normal(size=(3, 3)) * rng.uniform(0, 0.02)
+        self._inflate = rng.uniform(-0.01, 0.02)
+        self._centre, self._scale = np.zeros(3), 1.0
+        points = self(body).vertices
+        low, high = points.min(0), points.max(0)
+        self._centre, self._scale = (low + high) / 2, BASE_LONGEST_SIDE / (high - low).max()
+
+    def __call__(self, solid: Solid) -> Solid:
+        points = solid.vertices @ self._linear.T
+        points = points + np.sin(points @ self._waves + self._phases) @ self._shifts
+        points = points + self._inflate * vertex_normals(points, solid.faces)
+        return Solid((points - self._centre) * self._scale, solid.faces)
+
+
+def _distorted(part: Solid, rng: np.random.Generator) -> Solid:
+    """The part with other proportions, a little turned, moved, bent, and thinner or thicker."""
+    low, high = part.vertices.min(0), part.vertices.max(0)
+    middle, size = (low + high) / 2, (high - low).max()
+    linear = rotation(*rng.uniform(-8, 8, 3)) @ np.diag(rng.uniform(0.85, 1.15, 3) * rng.uniform(0.9, 1.1))
+    points = (part.vertices - middle) @ linear.T
+    waves = rng.normal(size=(3, 3)) * (4.0 / size)
+    points += np.sin(points @ waves + rng.uniform(0, 6, 3)) @ rng.normal(size=(3, 3)) * (size * rng.uniform(0, 0.02))
+    points += rng.uniform(-0.01, 0.02) * vertex_normals(points, part.faces)
+    return Solid(points + middle + rng.normal(size=3) * 0.015, part.faces)
+
+
+def _overview(rng: np.random.Generator) -> MosaicCamera:
+    fov = 2 * np.rad2deg(np.arctan(rng.uniform(1.05, 1.5) / 3.0))
+    target = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.25, 0.35), rng.uniform(-0.1, 0.1)])
+    return MosaicCamera(rng.uniform(0, 90), rng.uniform(-10, 45), fov, target)
+
+
+def _views(mosaic: np.ndarray) -> np.ndarray:
+    """The four views (4, C, 32, 32) of a mosaic (C, 64, 64)."""
+    channels, side = mosaic.shape[0], mosaic.shape[1] // 2
+    return mosaic.reshape(channels, 2, side, 2, side).transpose(1, 3, 0, 2, 4).reshape(4, channels, side, side)

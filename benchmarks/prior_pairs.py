@@ -1,0 +1,105 @@
+"""The pairs of body and part that the built-in prior is measured on in three dimensions, and where each part may grow.
+
+Bodies are the meshes of `scenes/`, none of which the prior's generator made. Ellipsoids are given in the canonical
+frame (base centred, longest side 1.8, front +z), so that their sizes can be compared; `regions_xml` writes them in the
+frame of the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fd_mitsuba.prior.captions import HELD_OUT, PART_WORDS
+from fd_mitsuba.scene.normalisation import Normalisation
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Half axes, turned about x and then about z (degrees), then moved to `centre`."""
+
+    centre: tuple[float, float, float]
+    half_axes: tuple[float, float, float]
+    about_x: float = 0.0
+    about_z: float = 0.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run.
+
+    Attributes:
+        scene: folder in `scenes/`.
+        body: word of the prompt.
+        part: key of the vocabulary's parts.
+        kind: the vocabulary's body for `body`; None: the prior knows no such body.
+        ellipsoids: where the part may grow; empty: the regions of the shipped scene.
+    """
+
+    scene: str
+    body: str
+    part: str
+    kind: str | None
+    ellipsoids: tuple[Ellipsoid, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene}+{self.part}".replace(" ", "_")
+
+    @property
+    def prompt(self) -> str:
+        return f"a {self.body} with {PART_WORDS[self.part][0]}"
+
+    @property
+    def untrained(self) -> bool:
+        """Whether the prior's training never showed the two together."""
+        return self.kind is None or (self.kind, self.part) in HELD_OUT
+
+
+def _mirrored(one: Ellipsoid) -> tuple[Ellipsoid, Ellipsoid]:
+    x, y, z = one.centre
+    return one, Ellipsoid((-x, y, z), one.half_axes, one.about_x, -one.about_z)
+
+
+CASES = (
+    # As shipped, or seen in training.
+    Case("pegasus", "horse", "wings", "horse"),
+    Case("unicorn", "pony", "horn", "horse"),
+    Case("deer", "deer", "antlers", "deer"),
+    Case("bronze_bull", "bull", "horns", "cow"),
+    Case("cat", "cat", "crown", "cat"),
+    Case("snowman", "snowman", "pointed hat", "snowman"),
+    Case("teddy_backpack", "bear", "backpack", "bear"),
+    Case("skateboard_dog", "dog", "skateboard", "dog"),
+    Case("mug", "mug", "handle", "mug"),
+    Case("vase", "vase", "flower", "vase"),
+    Case("rabbit_glasses", "rabbit", "top hat", "rabbit", (Ellipsoid((0, 0.48, 0.22), (0.29, 0.28, 0.29)),)),
+    Case("superhero", "person", "cape", "person", (Ellipsoid((0, -0.16, -0.27), (0.42, 0.68, 0.15)),)),
+    # Never shown together in training.
+    Case("pegasus", "horse", "cape", "horse", (Ellipsoid((0, 0.06, -0.13), (0.42, 0.33, 0.52)),)),
+    Case("cat", "cat", "backpack", "cat", (Ellipsoid((0, 0.31, 0.05), (0.26, 0.24, 0.32)),)),
+    Case("cat", "cat", "glasses", "cat", (Ellipsoid((0, 0.36, 0.82), (0.29, 0.13, 0.18)),)),
+    Case("snowman", "snowman", "flower", "snowman", (Ellipsoid((0, 0.84, 0.02), (0.25, 0.21, 0.22)),)),
+    Case("teddy_backpack", "bear", "spikes", "bear", (Ellipsoid((0, 0.0, -0.52), (0.14, 0.64, 0.22)),)),
+    Case("skateboard_dog", "dog", "horns", "dog", _mirrored(Ellipsoid((0.2, 0.62, 0.64), (0.23, 0.13, 0.13), 0, 42))),
+    Case("deer", "deer", "butterfly", "deer", (Ellipsoid((0, 0.7, 0.52), (0.4, 0.23, 0.32)),)),
+    Case("superhero", "person", "tail", "person", (Ellipsoid((0, 0.1, -0.36), (0.12, 0.29, 0.31)),)),
+    Case("cup_straw", "cup", "butterfly", "mug", (Ellipsoid((0, 0.62, 0), (0.5, 0.24, 0.42)),)),
+    Case("bronze_bull", "bull", "spikes", "cow", (Ellipsoid((0, 0.52, -0.1), (0.13, 0.22, 0.6), -9),)),
+    Case("rabbit_glasses", "rabbit", "cape", "rabbit", (Ellipsoid((0, -0.18, -0.42), (0.44, 0.56, 0.14), 28),)),
+    Case("stump_butterfly", "stump", "butterfly", None),
+)
+
+
+def regions_xml(case: Case, frame: Normalisation) -> list[str]:
+    """The case's ellipsoids as `focal_region` elements in the scene's own frame."""
+    elements, part = [], case.part.replace(" ", "_")
+    for number, region in enumerate(case.ellipsoids):
+        half = [value / frame.scale for value in region.half_axes]
+        x, y, z = frame.to_user(region.centre)
+        elements.append(
+            f'<shape type="focal_region" id="region_{number + 1}"><string name="part" value="{part}"/>'
+            f'<transform name="to_world"><scale x="{half[0]:.6g}" y="{half[1]:.6g}" z="{half[2]:.6g}"/>'
+            f'<rotate x="1" angle="{region.about_x:g}"/><rotate z="1" angle="{region.about_z:g}"/>'
+            f'<translate x="{x:.6g}" y="{y:.6g}" z="{z:.6g}"/></transform></shape>'
+        )
+    return elements

@@ -1,0 +1,137 @@
+"""The command `evaluate`: figures of finished runs, and of the shipped scenes from nothing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+from fd_mitsuba.cli_options import machine_options, remark, start
+from fd_mitsuba.errors import UserError
+
+
+def judge_options(parser: argparse.ArgumentParser) -> None:
+    """Who looks, and at what."""
+    parser.add_argument(
+        "--judge", metavar="MODEL", help="CLIP model by folder or hub id; default: the built-in evaluator"
+    )
+    parser.add_argument("--views", type=int, default=100, metavar="N", help="on a ring at 45 degrees; default: 100")
+    parser.add_argument("--size", type=int, default=96, metavar="N", help="pixels a side; default: 96")
+    parser.add_argument("--spp", type=int, default=16, metavar="N", help="samples a pixel; default: 16")
+
+
+def batch_options(parser: argparse.ArgumentParser, folder: str, default: str | None, seeds: list[int]) -> None:
+    """What to run first; `folder` is what the help says of the default."""
+    parser.add_argument("-c", "--config", default="configs/quick.toml", metavar="FILE", help="default: %(default)s")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--seeds", nargs="+", type=int, default=seeds, metavar="N", help="default: %(default)s")
+    parser.add_argument("-o", "--output", default=default, metavar="FOLDER", help=f"of these runs; default: {folder}")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="runs at a time; default: 1")
+
+
+def add_evaluate_commands(commands: argparse._SubParsersAction) -> None:
+    """Put `evaluate` beside the other commands."""
+    evaluate = commands.add_parser("evaluate", help="figures of finished runs: CLIP scores, base, part, cost")
+    evaluate.add_argument(
+        "runs", nargs="*", metavar="RUN", help="run folders; a scene file is run first, as the options below say"
+    )
+    evaluate.add_argument(
+        "--all", action="store_true", help="every shipped scene that the built-in prior can read, run if need be"
+    )
+    judge_options(evaluate)
+    evaluate.add_argument(
+        "--pictures",
+        choices=("auto", "lit", "shape"),
+        default="auto",
+        help="lit by the scene, or the bare shape; default: lit where there is an appearance",
+    )
+    batch_options(evaluate, "runs/evaluate", "runs/evaluate", [0, 1, 2])
+    evaluate.add_argument(
+        "--scenes", default="scenes", metavar="FOLDER", help="whose prompts are the rivals; default: %(default)s"
+    )
+    evaluate.add_argument("--again", action="store_true", help="also what is evaluated already")
+    evaluate.add_argument("--json", metavar="FILE", help="write all figures of all runs")
+    evaluate.add_argument("--markdown", metavar="FILE", help="write the table")
+    machine_options(evaluate)
+    evaluate.set_defaults(call=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    if options.all == bool(options.runs):
+        raise UserError("evaluate: give run folders or scene files, or --all")
+    start(options)
+    from rich.console import Console
+
+    from fd_mitsuba.evaluate import Protocol, builtin_vocabulary, evaluate_run
+    from fd_mitsuba.evaluation.clip import ClipJudge
+    from fd_mitsuba.evaluation.scene_prompts import prompts_of_scenes
+    from fd_mitsuba.evaluation.score_table import COLUMNS, SHORT, header, rich_table, score_rows, summary_lines
+    from fd_mitsuba.training.checkpoint import write_atomically
+
+    protocol = Protocol(options.views, options.size, options.spp, options.pictures)
+    judge = ClipJudge.load(options.judge)
+    rivals = prompts_of_scenes(Path(options.scenes)) if options.all or Path(options.scenes).is_dir() else []
+    runs, scenes = [Path(run) for run in options.runs], []
+    if options.all:
+        vocabulary = builtin_vocabulary()
+        scenes = [rival.scene for rival in rivals if vocabulary is None or rival.known_to(vocabulary)]
+    else:
+        scenes = [run for run in runs if _is_scene(run)]
+        runs = [run for run in runs if not _is_scene(run)]
+    failed = 0
+    if scenes:
+        made, failed = run_scenes(options, scenes)
+        runs += made
+    results = []
+    for run in runs:
+        try:
+            results.append(evaluate_run(run, judge, protocol, rivals, options.again))
+        except UserError as error:
+            if len(runs) == 1:
+                raise
+            failed += 1
+            remark(f"error: {error}")
+    if options.json:
+        write_atomically(Path(options.json), (json.dumps({"runs": results}, indent=2) + "\n").encode())
+    if options.markdown:
+        write_atomically(Path(options.markdown), _document(results).encode())
+    shown = [COLUMNS[name] for name in SHORT]
+    Console(width=None if os.isatty(1) else 200).print(rich_table(header(shown), score_rows(results, shown)))
+    for line in summary_lines(results):
+        print(line)
+    return 1 if failed else 0
+
+
+def _document(results: list[dict]) -> str:
+    """Markdown: what holds in how many runs, a table by scene where there are several seeds, a table of all runs."""
+    from fd_mitsuba.evaluation.score_table import (
+        COLUMNS,
+        header,
+        markdown_table,
+        scene_rows,
+        score_rows,
+        summary_lines,
+    )
+
+    columns = list(COLUMNS.values())
+    blocks = ["".join(f"- {line}\n" for line in summary_lines(results))]
+    if len({found["scene"] for found in results}) < len(results):
+        titles = ["runs" if title == "seed" else title for title in header(columns)]
+        blocks.append(markdown_table(titles, scene_rows(results, columns)))
+    return "\n".join([*blocks, markdown_table(header(columns), score_rows(results, columns))])
+
+
+def run_scenes(options: argparse.Namespace, scenes: list[Path]) -> tuple[list[Path], int]:
+    """Run what is missing of scenes by seeds; the folders of the finished runs, and how many failed."""
+    from fd_mitsuba.batch import job_matrix, run_batch
+
+    folder = Path(options.output)
+    jobs = job_matrix(scenes, [Path(options.config)], options.seeds, options.overrides, folder)
+    outcomes = run_batch(jobs, options.workers, remark, record=folder / "batch.json")
+    done = [outcome.job.folder for outcome in outcomes if outcome.state in ("finished", "skipped")]
+    return done, len(outcomes) - len(done)
+
+
+def _is_scene(path: Path) -> bool:
+    return path.suffix == ".xml" or ((path / "scene.xml").is_file() and not (path / "run.json").is_file())

@@ -1,0 +1,127 @@
+"""A rough forecast of what a run will cost, before anyone waits for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import union_sdf
+
+START_AND_EXPORT_SECONDS = 15.0
+"""What every run takes besides its steps: imports, kernels, meshes, turntable."""
+
+LIT_PICTURES_SECONDS = 45.0
+"""What the appearance stage takes besides its steps: kernels, lit turntable, baked pictures."""
+
+_OPERATIONS = 6e10
+"""Floating-point operations a second of two cores on the networks of Stable Diffusion."""
+
+_REACH = 0.15
+"""How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
+
+
+@dataclass(frozen=True)
+class CostEstimate:
+    """A rough forecast: within a factor of two on a machine like the one of the assumptions."""
+
+    active_vertices: int
+    active_share: float
+    seconds_per_step: float
+    seconds_total: float
+    memory_mb: float
+    """These are of the geometry stage."""
+    appearance_seconds_per_step: float
+    appearance_seconds_total: float
+    """0 where the stage is left out."""
+    assumptions: tuple[str, ...]
+
+
+def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
+    """A rough forecast of a run's time and of the geometry stage's memory, by counting what a step touches.
+
+        step = fixed + field (active vertices) + surface (faces) + rays + guidance (passes of the networks)
+
+    averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
+    them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores, no GPU:
+    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase, peaks of
+    1.1, 1.2 and 1.2 GB; importing, compiling and exporting took 15 s.
+    """
+    geometry, guidance = config.geometry, config.guidance
+    axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
+    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    share = float(np.mean(union_sdf(scene.regions, lattice) > -_REACH))
+    vertices = (geometry.grid_resolution + 1) ** 3
+    active = round(share * vertices)
+
+    queries = active + geometry.focal_samples
+    field = 3.5e-8 * config.field.levels * queries
+    surface = 8e-7 * 8.6 * vertices ** (2 / 3)
+    builtin = guidance.model == "builtin"
+    side = 32 if builtin else 64
+    refined = 1 - geometry.coarse_fraction
+    coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
+    refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
+    weights, source = _unet_weights(guidance.model)
+    passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
+    if builtin:
+        forward, encoder = 0.1 / 4, 0.1 / 4  # four views are one picture to it
+    else:
+        # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
+        forward, encoder = 800.0 * weights / _OPERATIONS, 2.2e12 / _OPERATIONS
+    image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
+    step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
+    assumptions = (
+        "2 cores of about 60 GFLOP/s together, otherwise idle, and views at the size of the latent",
+        f"a UNet of {weights / 1e6:.3g} million weights ({source})",
+        f"{queries} queries of the part's field a step",
+    )
+    memory = 850 + 5e-5 * vertices + 7e-5 * queries * config.field.levels
+    if geometry.lambda_sds > 0:
+        size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
+        memory += 100 + 1.2e-6 * weights * size
+        if not builtin:  # as `guidance.memory` will demand: one call of the UNet, and the encoder's maps for half of it
+            memory += 65 * size * guidance.views_per_call + 3300 * max(1, guidance.views_per_call // 2)
+    total = step * geometry.steps + START_AND_EXPORT_SECONDS
+    lit = _appearance_step(config, forward, encoder)
+    if builtin and scene.subtracts and config.appearance.lambda_sds > 0:  # the run leaves the stage out
+        return CostEstimate(active, share, step, total, memory, 0.0, 0.0, assumptions)
+    lit_total = lit * config.appearance.steps + LIT_PICTURES_SECONDS
+    return CostEstimate(active, share, step, total, memory, lit, lit_total, assumptions)
+
+
+def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float:
+    """Seconds of a step of the appearance stage: fixed + light samples + passes of the networks.
+
+    Fitted to `benchmarks/appearance_step.py` (0.5 s for 4 views of 128 x 128 pixels and 16 samples) and to runs of
+    `configs/quick.toml`. Each bounce beyond the first costs about half of that light.
+
+    Args:
+        forward, encoder: seconds for a view through the UNet, and through the VAE's encoder and back.
+    """
+    settings = config.appearance
+    builtin = config.guidance.model == "builtin"
+    guided = settings.lambda_sds > 0
+    side = settings.picture_size or ((32 if builtin else 512) if guided else 128)
+    samples = settings.views * side**2 * settings.spp
+    depth = settings.max_depth if settings.max_depth > 0 else 8
+    light = 3.4e-7 * samples * (1 + 0.5 * (depth - 2))
+    passes = settings.views * (2 if settings.guidance_scale != 1 else 1)
+    # A prior in pixels needs no encoder; it is shown the part in clay as well.
+    image = passes * forward + (0.3 * light if builtin else settings.views * encoder)
+    return 0.15 + light + (0.03 if settings.style else 0.0) + (image if guided else 0.0)
+
+
+def _unet_weights(model: str) -> tuple[float, str]:
+    folder = Path(model) / "unet"
+    files = list(folder.glob("*.safetensors")) or list(folder.glob("*.bin"))
+    if files:
+        size = max(file.stat().st_size for file in files)
+        return size / (2 if ".fp16." in files[0].name else 4), f"from {folder}"
+    if model == "builtin":
+        return 7.0e6, "the built-in prior"
+    return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"

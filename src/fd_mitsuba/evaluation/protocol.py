@@ -1,0 +1,90 @@
+"""The evaluation of one finished run: 100 views of it and of its base, and every figure that follows from them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from fd_mitsuba.evaluation.base_drift import export_drift, picture_drift
+from fd_mitsuba.evaluation.front_in_back import front_in_back
+from fd_mitsuba.evaluation.judged_views import ELEVATION_DEG, JudgedViews
+from fd_mitsuba.evaluation.part_check import check_parts
+from fd_mitsuba.evaluation.scene_prompts import other_parts
+from fd_mitsuba.evaluation.similarity import EditPrompt, Judge, clip_scores, retrieval
+from fd_mitsuba.guidance.vocabulary import Vocabulary
+from fd_mitsuba.scene.edit_scene import EditScene
+
+FORMAT = 1
+
+
+def judged(
+    views: JudgedViews,
+    judge: Judge,
+    words: EditPrompt,
+    simple: str | None,
+    rivals: Sequence[EditPrompt],
+    vocabulary: Vocabulary | None,
+) -> dict:
+    """What a judge says of the views; every group of figures names it.
+
+    Args:
+        words: the run's own.
+        simple: the simplified prompt, if there is one.
+        rivals: edit prompts of other scenes, that the run's own has to be found among.
+        vocabulary: for sentences about the same body with other parts; None: none.
+    """
+    by = {"judge": judge.name, "kind": views.kind}
+    edited, base, start = (judge.images(pictures) for pictures in (views.edited, views.base, views.start))
+    clip = by | clip_scores(judge, edited, base, words)
+    begun = clip_scores(judge, start, base, words)
+    clip |= {f"{name}_start": begun[name] for name in ("sim", "dir_dot", "dir_cosine") if name in begun}
+    found: dict = {"clip": clip}
+    if simple is not None:
+        found["clip_simple"] = by | {"prompt": simple}
+        found["clip_simple"] |= clip_scores(judge, edited, base, EditPrompt(simple, words.base_prompt))
+    others = [rival for rival in dict.fromkeys(rivals) if rival.prompt != words.prompt]
+    for name, choice in {
+        "retrieval": ([words, *others], 0) if others else None,
+        "retrieval_parts": None if vocabulary is None else other_parts(words.prompt, vocabulary),
+    }.items():
+        if choice is not None:
+            before = retrieval(judge, start, base, *choice)
+            found[name] = by | retrieval(judge, edited, base, *choice)
+            found[name] |= {f"{key}_start": value for key, value in before.items() if key != "candidates"}
+    faces = front_in_back(edited, base, views.azimuth_deg)
+    found["multi_face"] = by | ({} if faces is None else asdict(faces))
+    return found
+
+
+def measured(scene: EditScene, folder: Path, views: JudgedViews) -> dict:
+    """What needs no judge: base, part, locality, cost; the last two as the run itself has measured them."""
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        "base": {
+            "identical": metrics["base_identical"],
+            **({} if scene.subtracts else picture_drift(views)),
+            **export_drift(scene, folder),
+        },
+        "part": {
+            "leakage": 1.0 - metrics["inside_fraction"],
+            "overlap": metrics["overlap_fraction"],
+            "volume": metrics["part_volume"],
+            "manifold": metrics["manifold"],
+            "islands_removed": metrics["islands_removed"],
+            "gap": metrics["gap"],
+            "parts": check_parts(scene.parts, folder, scene.frame.scale),
+        },
+        "cost": {"seconds": metrics["seconds"], "peak_memory_mb": metrics.get("peak_memory_mb")},
+    }
+
+
+def about_views(views: JudgedViews) -> dict:
+    """How the pictures were taken, for the record."""
+    return {
+        "kind": views.kind,
+        "count": len(views.edited),
+        "size": views.edited.shape[-1],
+        "elevation_deg": ELEVATION_DEG,
+    }
