@@ -109,7 +109,7 @@ def run_batch(
         if record is not None:
             write_record(record, jobs, outcomes)
 
-    token = f"batch {time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}"
+    token = f"batch {time.time_ns()}-{os.getpid()}"
     with _stop_requests() as stops:
         if record is not None:
             write_record(record, jobs, outcomes)

@@ -77,7 +77,7 @@ def test_every_pipeline_guides(folders: dict[str, Path], kind: str) -> None:
 
 
 @pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction"])
-@pytest.mark.parametrize("kind", ["builtin", "sd15"])
+@pytest.mark.parametrize("kind", ["builtin", pytest.param("sd15", marks=pytest.mark.slow)])
 def test_every_variant_guides_three_steps(folders: dict[str, Path], kind: str, variant: str) -> None:
     guidance = load(folders[kind], variant, guidance_scale=3.0)
     views = views_of(guidance)

@@ -72,6 +72,7 @@ def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
     return root
 
 
+@pytest.mark.slow
 def test_an_ablation_from_runs_to_table(place: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     rows = chosen_rows(["no_focal", "single_path"])
     jobs = ablation_jobs(place / "scene.xml", place / "tiny.toml", [0], rows, place / "out")

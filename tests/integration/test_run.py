@@ -304,7 +304,7 @@ def test_signal_before_the_first_step(place: Path, number: signal.Signals) -> No
     assert (process.returncode, errors) == (130, "fd_mitsuba: interrupted; continue with --resume\n")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_signal_during_the_export(place: Path, number: signal.Signals) -> None:
     output = f"export_{number.name}"
     more = (*LONG[:2], "--set", "output.turntable_frames=150")

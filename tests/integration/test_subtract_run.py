@@ -190,6 +190,7 @@ PAINTED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_turntable")
 def test_the_faces_of_a_cut_learn_a_material(make_scene: Make, ball: str, tmp_path: Path, mi: Any) -> None:
     """Without guidance the style losses alone teach it, here on all of it: it takes the ball's paint."""
