@@ -14,7 +14,6 @@ medians of whole optimiser steps: random cameras, primary rays, field, shading, 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
@@ -29,7 +28,7 @@ from fd_mitsuba.threads import share_cores  # noqa: E402
 share_cores()
 
 import torch  # noqa: E402
-from machine import kernels_compiled, machine, resident_mb  # noqa: E402
+from machine import kernels_compiled, print_figures, resident_mb  # noqa: E402
 from plain_appearance import PlainAppearance, uv_ball  # noqa: E402
 
 from fd_mitsuba.config import CamerasConfig  # noqa: E402
@@ -140,12 +139,7 @@ def main() -> None:
         result = measure_memory(bench, options.memory)
     else:
         result = measure(bench, options.repeats, options.plain_repeats)
-    result["machine"] = machine()
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return
-    for name, value in result.items():
-        print(f"{name:20} {value}")
+    print_figures(result, options.json)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ in all four formats: atlas, baked pictures, files. Mitsuba and the scene are loa
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -26,12 +25,13 @@ from fd_mitsuba.threads import share_cores  # noqa: E402
 share_cores()
 
 import numpy as np  # noqa: E402
-from machine import machine, peak_mb  # noqa: E402
+from machine import print_figures  # noqa: E402
 
 from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.export.assets import PartAsset, export_assets  # noqa: E402
 from fd_mitsuba.fields.texture import TextureField  # noqa: E402
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
+from fd_mitsuba.training.record import peak_memory_mb  # noqa: E402
 
 
 def lumpy_ball(faces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +61,7 @@ def measure(scene: EditScene, faces: int, texture_size: int) -> dict[str, Any]:
     centre = np.mean([region.bounds for region in scene.regions], axis=(0, 1))
     name = next(iter(scene.parts))
     part = PartAsset(scene.frame.to_user(0.3 * vertices + centre), triangles, TextureField(seed=0))
-    before = peak_mb()
+    before = peak_memory_mb()
     with tempfile.TemporaryDirectory() as folder:
         began, cpu = time.perf_counter(), time.process_time()
         written = export_assets(scene, RunConfig(), {name: part}, Path(folder), texture_size=texture_size)
@@ -72,8 +72,8 @@ def measure(scene: EditScene, faces: int, texture_size: int) -> dict[str, Any]:
         "texture_size": texture_size,
         "seconds": round(seconds, 2),
         "cpu_seconds": round(cpu_seconds, 2),
-        "peak_mb": round(peak_mb()),
-        "before_mb": round(before),
+        "peak_mb": peak_memory_mb(),
+        "before_mb": before,
         "written_mb": round(size / 2**20, 1),
     }
 
@@ -87,12 +87,7 @@ def main() -> None:
     parser.add_argument("--scene", default=str(ROOT / "scenes" / "pegasus" / "scene.xml"))
     options = parser.parse_args()
     result = measure(load_edit_scene(options.scene, {}), options.faces, options.texture_size)
-    result["machine"] = machine()
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return
-    for name, value in result.items():
-        print(f"{name:20} {value}")
+    print_figures(result, options.json)
 
 
 if __name__ == "__main__":

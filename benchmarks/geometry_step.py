@@ -17,7 +17,6 @@ part wanders and its topology changes. Times are medians of whole optimiser step
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
@@ -35,7 +34,7 @@ from fd_mitsuba.threads import share_cores  # noqa: E402
 share_cores()
 
 import torch  # noqa: E402
-from machine import kernels_compiled, machine, resident_mb  # noqa: E402
+from machine import kernels_compiled, print_figures, resident_mb  # noqa: E402
 from plain_reference import render_plain  # noqa: E402
 
 from fd_mitsuba.config import RunConfig  # noqa: E402
@@ -229,12 +228,7 @@ def main() -> None:
         result = measure_memory(scene, options.memory)
     else:
         result = measure(scene, options.repeats, options.plain_repeats)
-    result["machine"] = machine()
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return
-    for name, value in result.items():
-        print(f"{name:20} {value}")
+    print_figures(result, options.json)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,23 @@
-"""What the benchmarks share: the machine they ran on, its memory, and the kernels that a step still compiles."""
+"""What the benchmarks share: how they print figures, the machine, its memory, and the kernels that a step compiles."""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
-import resource
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+
+def print_figures(figures: dict[str, Any], as_json: bool) -> None:
+    """Print them and the machine that they depend on: as JSON, or a line each for people."""
+    figures = {**figures, "machine": machine()}
+    if as_json:
+        print(json.dumps(figures, indent=2))
+        return
+    for name, value in figures.items():
+        print(f"{name:20} {value}")
 
 
 def kernels_compiled(steps: Callable[[], Any]) -> int:
@@ -27,11 +37,6 @@ def resident_mb() -> float:
     """Resident memory of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE") / 2**20
-
-
-def peak_mb() -> float:
-    """The most resident memory that this process has had."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def machine() -> dict[str, Any]:

@@ -28,7 +28,7 @@ from prior_pairs import CASES, Case, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
 from fd_mitsuba.evaluation.turntable import render_ring, write_sheet  # noqa: E402
-from fd_mitsuba.pipeline import load_finished_stage  # noqa: E402
+from fd_mitsuba.geometry import load_finished_stage  # noqa: E402
 from fd_mitsuba.prior.corpus import CAMERA_RADIUS  # noqa: E402
 from fd_mitsuba.prior.part_judge import (  # noqa: E402
     CHECKOUT_CLASSIFIER,

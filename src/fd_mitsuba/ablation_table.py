@@ -12,7 +12,7 @@ from fd_mitsuba.ablation import RowResult
 from fd_mitsuba.evaluation.junction import junction_pictures
 from fd_mitsuba.evaluation.score_table import COLUMNS, Column, spread_text
 from fd_mitsuba.evaluation.turntable import write_sheet
-from fd_mitsuba.pipeline import load_finished_stage
+from fd_mitsuba.geometry import load_finished_stage
 from fd_mitsuba.training.record import write_picture
 from fd_mitsuba.training.saved_run import saved_run
 

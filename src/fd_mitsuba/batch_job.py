@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.training.json_object import read_json_object
 
 PROGRAM = (sys.executable, "-m", "fd_mitsuba")
 FINISHED, SKIPPED, FAILED, INTERRUPTED, KILLED = "finished", "skipped", "failed", "interrupted", "killed"
@@ -103,7 +103,9 @@ def is_finished(job: Job) -> bool:
     Raises:
         UserError: the job's own settings cannot be read.
     """
-    metrics, known, settings = (_read(job.folder / name) for name in ("metrics.json", "run.json", "config.json"))
+    metrics, known, settings = (
+        read_json_object(job.folder / name) or {} for name in ("metrics.json", "run.json", "config.json")
+    )
     stages = {"geometry"} if job.stage == "geometry" else {"geometry", "appearance"}
     if not stages <= set(metrics.get("stages", ())):
         return False
@@ -139,7 +141,8 @@ def perform(
         stops: how often the user has asked to stop: once lets the run save its state, twice kills it.
     """
     if is_finished(job) and not attempts(job, token):
-        return Outcome(job, SKIPPED, seconds=float(_read(job.folder / "metrics.json").get("seconds", 0)))
+        metrics = read_json_object(job.folder / "metrics.json") or {}
+        return Outcome(job, SKIPPED, seconds=float(metrics.get("seconds", 0)))
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with open(job.log, "ab") as log:
         if not _locked(log, stops):
@@ -218,11 +221,3 @@ def _scene_is_unchanged(job: Job) -> bool:
             if not origin.is_file() or origin.read_bytes() != copy.read_bytes():
                 return False
     return record.is_dir()
-
-
-def _read(path: Path) -> dict:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return data if isinstance(data, dict) else {}

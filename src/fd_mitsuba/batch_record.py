@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fd_mitsuba.batch_job import FAILED, Job, Outcome
+from fd_mitsuba.training.json_object import read_json_object
 
 _STYLES = {"finished": "green", "skipped": "dim", "failed": "bold red", "interrupted": "yellow"}
 
@@ -29,10 +30,7 @@ def write_record(path: Path, jobs: Sequence[Job], outcomes: Mapping[Job, Outcome
 
 def read_record(path: Path) -> list[dict]:
     """The rows of a `batch.json`; none where there is none or it is damaged."""
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["jobs"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+    rows = (read_json_object(path) or {}).get("jobs")
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 

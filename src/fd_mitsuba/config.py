@@ -23,10 +23,6 @@ from fd_mitsuba.config_sections import (
 )
 from fd_mitsuba.errors import UserError
 
-_LATER = {
-    "guidance": ("reconstruction_steps", "ism_interval", "ism_inversion_step", "timestep_annealing"),
-}
-"""Settings that came after the first runs: at their defaults they leave the hash as it was; old runs stay readable."""
 _WITHOUT_EFFECT = {"guidance": ("device",)}
 """Settings that change where the work is done and not what comes out."""
 
@@ -61,11 +57,6 @@ class RunConfig(Section):
         """Sixteen hex digits that change with any setting that the stage depends on, its own and those before it."""
         later = {"texture", "appearance"} if stage == "geometry" else set()
         values = self.model_dump(mode="json", exclude=later)
-        defaults = RunConfig().model_dump(mode="json")
-        for section, names in _LATER.items():
-            for name in names:
-                if values[section][name] == defaults[section][name]:
-                    del values[section][name]
         for section, names in _WITHOUT_EFFECT.items():
             for name in names:
                 del values[section][name]

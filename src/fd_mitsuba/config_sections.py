@@ -55,6 +55,10 @@ class GeometryConfig(Section):
     focal_samples: Count = 10240
     lambda_collision: NonNegative = 100.0
     lambda_volume: NonNegative = 0.0
+    lambda_presence: NonNegative = 0.0
+    """Weight of the loss that leaves no focal region without a part; not in the paper."""
+    presence_share: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """Share of each region, outside the base, that it keeps filled."""
     views: Count = 4
     spp: Count = 4
     silhouette_spp: Count = 1
@@ -152,8 +156,6 @@ class GuidanceConfig(Section):
     weighting: Literal["sds", "uniform", "fantasia3d", "inverse"] = "sds"
     timestep_range_coarse: Range = (0.02, 0.35)
     timestep_range_refined: Range = (0.02, 0.35)
-    timestep_anneal: Fraction = 0.0
-    """Share of the range by which the upper end has come down at the last step of a phase; 0 keeps it."""
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
     """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
     normalise_gradient: bool = False
@@ -163,15 +165,6 @@ class GuidanceConfig(Section):
     device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d+)?)$")] = "cpu"
     """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
-
-    @model_validator(mode="after")
-    def _one_annealing(self) -> GuidanceConfig:
-        if self.timestep_annealing != "none" and self.timestep_anneal > 0:
-            raise ValueError(
-                f"guidance.timestep_anneal = {self.timestep_anneal} and guidance.timestep_annealing = "
-                f"{self.timestep_annealing} both lower t; set one of them"
-            )
-        return self
 
 
 class CamerasConfig(Section):

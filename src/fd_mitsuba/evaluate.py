@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +19,12 @@ from fd_mitsuba.evaluation.judged_views import JudgedViews, lit_views, shape_vie
 from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
 from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
 from fd_mitsuba.evaluation.similarity import EditPrompt, Judge
+from fd_mitsuba.geometry import load_finished_stage
 from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
 from fd_mitsuba.guidance.vocabulary import Vocabulary
-from fd_mitsuba.pipeline import load_finished_stage
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.training.json_object import read_json_object
 from fd_mitsuba.training.record import write_picture
 from fd_mitsuba.training.run_folder import write_json
 from fd_mitsuba.training.saved_run import saved_run
@@ -78,7 +78,7 @@ def evaluate_run(
         raise UserError(f"{folder}: no metrics.json; give the -o folder of a finished run")
     path = folder / (RESULT_NAME if protocol.pictures != "shape" else "evaluation_shape.json")
     key = _key(folder, judge, protocol, rivals)
-    known = _read(path)
+    known = read_json_object(path) or {}
     if not again and known.get("key") == key:
         return known
     scene, config = saved_run(folder)
@@ -147,11 +147,3 @@ def _key(folder: Path, judge: Judge, protocol: Protocol, rivals: Sequence[SceneP
     digest = hashlib.sha256((folder / "metrics.json").read_bytes())
     digest.update(repr((FORMAT, judge.name, protocol, [(rival.name, rival.words) for rival in rivals])).encode())
     return digest.hexdigest()[:16]
-
-
-def _read(path: Path) -> dict:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return data if isinstance(data, dict) else {}

@@ -29,7 +29,7 @@ def test_a_bite(
     y: float,
     z: float,
 ) -> None:
-    monkeypatch.setattr("fd_mitsuba.pipeline._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
     regions, folder = tmp_path / "bite.xml", tmp_path / "run"
     regions.write_text(BITE.format(size=0.12, y=y, z=z))
     scene = load_edit_scene(first / "mitsuba" / "scene.xml", regions=regions, prompt="a pig with a bite")

@@ -77,7 +77,7 @@ def test_an_ablation_from_runs_to_table(place: Path, monkeypatch: pytest.MonkeyP
     rows = chosen_rows(["no_focal", "single_path"])
     jobs = ablation_jobs(place / "scene.xml", place / "tiny.toml", [0], rows, place / "out")
     scene = load_edit_scene(place / "scene.xml")
-    monkeypatch.setattr(pipeline, "_write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
     for job in (*jobs[0], *jobs[1]):  # in this process: the batch then finds them finished
         stages = pipeline.STAGES if job.stage == "all" else ("geometry",)
         pipeline.run(scene, job.settings(), job.folder, False, "", True, lambda line: None, stages, job.geometry_from)

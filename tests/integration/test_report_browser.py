@@ -6,7 +6,6 @@ The browser needs chromium and `npm install` in tools/viewers.
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -14,20 +13,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from report_setup import make_run
-from test_export_assets import VIEWERS, Learned, exported, textured_base  # noqa: F401
+from test_export_assets import Learned, exported, textured_base  # noqa: F401
+from viewer_setup import VIEWERS, needs_browser
 
 from fd_mitsuba.evaluation.gallery import write_gallery
 from fd_mitsuba.evaluation.report import write_report
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.timeout(900),
-    pytest.mark.skipif(
-        shutil.which("chromium") is None or not (VIEWERS / "node_modules" / "playwright-core").is_dir(),
-        reason="needs chromium, and npm install in tools/viewers",
-    ),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), needs_browser]
 
 
 def opened(page: Path, picture: Path, width: int, scheme: str) -> dict:

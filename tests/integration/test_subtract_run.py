@@ -65,7 +65,7 @@ def ball(tmp_path: Path) -> str:
 @pytest.fixture
 def no_turntable(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves out the pictures, which take most of such a run's time."""
-    monkeypatch.setattr("fd_mitsuba.pipeline._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
 
 
 def lens() -> float:

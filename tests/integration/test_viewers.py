@@ -6,7 +6,6 @@ Blender is Debian's package with python3-numpy; the browser needs chromium and `
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_export_assets import VIEWERS, Learned, exported, textured_base  # noqa: F401
+from test_export_assets import Learned, exported, textured_base  # noqa: F401
+from viewer_setup import VIEWERS, needs_blender, needs_browser
 
 from fd_mitsuba.export.pictures import srgb_from_linear
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
@@ -32,10 +32,9 @@ def export(make_scene: Make, textured_base: str, tmp_path: Path) -> tuple[EditSc
     return scene, tmp_path / "out"
 
 
+@needs_blender
 @pytest.mark.parametrize("model", ["asset.glb", "obj/asset.obj"])
 def test_blender(export: tuple[EditScene, Path], model: str, tmp_path: Path, mi: Any) -> None:
-    if shutil.which("blender") is None:
-        pytest.skip("needs blender")
     scene, folder = export
     command = [
         "blender",
@@ -74,9 +73,8 @@ def test_blender(export: tuple[EditScene, Path], model: str, tmp_path: Path, mi:
     assert difference.mean() < 3 / 255
 
 
+@needs_browser
 def test_browser(export: tuple[EditScene, Path], tmp_path: Path) -> None:
-    if shutil.which("chromium") is None or not (VIEWERS / "node_modules" / "playwright-core").is_dir():
-        pytest.skip("needs chromium, and npm install in tools/viewers")
     picture = tmp_path / "browser.png"
     command = ["node", str(VIEWERS / "screenshot_glb.mjs"), str(export[1] / "asset.glb"), str(picture)]
     done = subprocess.run(command, capture_output=True, text=True)

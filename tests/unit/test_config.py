@@ -199,11 +199,6 @@ def test_bad_guidance_is_one_line(override: str, expected: str) -> None:
     assert expected in message and f"--set guidance.{override}" in message
 
 
-def test_two_ways_to_lower_t_are_refused() -> None:
-    message = refusal(None, "guidance.timestep_anneal=0.5", "guidance.timestep_annealing=linear")
-    assert "both lower t" in message
-
-
 def test_hash_follows_every_setting() -> None:
     overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "output.sheet_every=3", "cameras.aim=object"]
     hashes = [load_config(None, [override]).content_hash() for override in overrides]

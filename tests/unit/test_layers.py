@@ -12,7 +12,7 @@ import fd_mitsuba
 ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
     "conventions errors config_sections config mitsuba_api threads scene fields extraction render guidance losses "
-    "training export evaluation prior cost check preview doctor appearance pipeline parts cli_options "
+    "training export evaluation prior cost check preview doctor geometry appearance pipeline parts cli_options "
     "batch_job batch_record batch_ray batch cli_batch cli_report evaluate ablation ablation_table "
     "cli_evaluate cli_ablate cli_export cli_prior cli __main__"
 ).split()

@@ -118,13 +118,6 @@ def test_timesteps_repeat_with_the_generator_and_stay_in_bounds() -> None:
     assert sds.draw_timesteps((0.5, 0.5), 1000, 3, torch.Generator().manual_seed(1)).unique().tolist() == [500]
 
 
-def test_anneal_brings_the_upper_end_down() -> None:
-    assert sds.annealed_range((0.2, 0.8), 0.0, 1.0) == (0.2, 0.8)
-    assert sds.annealed_range((0.2, 0.8), 0.5, 0.0) == (0.2, 0.8)
-    assert sds.annealed_range((0.2, 0.8), 0.5, 1.0) == pytest.approx((0.2, 0.5))
-    assert sds.annealed_range((0.2, 0.8), 1.0, 0.5) == pytest.approx((0.2, 0.5))
-
-
 def test_normalised_gradient_has_mean_size_one() -> None:
     assert sds.normalising_scale(latents(1.0, -3.0)) == 0.5
     assert math.isfinite(sds.normalising_scale(latents(0.0, 0.0)))

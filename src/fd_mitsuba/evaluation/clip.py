@@ -107,10 +107,6 @@ class ClipJudge:
         with network_threads():
             return _pooled(self._model.get_text_features(tokens.input_ids, tokens.attention_mask))
 
-    def similarity(self, pictures: Tensor, texts: list[str]) -> Tensor:
-        """Cosines (N, M) between pictures (N, 3, H, W) and texts: CLIP_sim is the mean of a column."""
-        return cosines(self.images(pictures), self.texts(texts))
-
     def unknown_words(self, text: str) -> list[str]:
         """Words that the model has never seen; always none where it has CLIP's own vocabulary."""
         words = dict.fromkeys(re.findall(r"[^\W\d_]+", text.lower())) if self._whole_words else {}
@@ -118,7 +114,7 @@ class ClipJudge:
 
 
 def cosines(image_features: Tensor, text_features: Tensor) -> Tensor:
-    """Cosines (N, M) between the rows of (N, D) and (M, D)."""
+    """Cosines (N, M) between the rows of (N, D) and (M, D): CLIP_sim is the mean of a column."""
     return normalize(image_features, dim=-1) @ normalize(text_features, dim=-1).T
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from pydantic import ValidationError
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.training.json_object import read_json_object
 from fd_mitsuba.training.record import read_metrics
 
 _BASE_PROMPT = re.compile(r'name="base_prompt"\s+value="([^"$]+)"')
@@ -66,7 +66,9 @@ def read_run(folder: Path) -> RunRecord:
     if not (folder / "run.json").is_file():
         raise UserError(f"{folder}: not a run (no run.json); give the -o folder of a run")
     names = ("run", "metrics", "evaluation", "config", "environment")
-    identity, metrics, evaluation, settings, environment = (_read(folder / f"{name}.json") for name in names)
+    identity, metrics, evaluation, settings, environment = (
+        read_json_object(folder / f"{name}.json") or {} for name in names
+    )
     rows: dict[str, list[dict]] = {}
     for row in read_metrics(folder / "metrics.jsonl"):
         rows.setdefault(str(row.get("stage", "")), []).append(row)
@@ -128,11 +130,3 @@ def _recorded_base_prompt(folder: Path, scene: str) -> str:
         return ""
     found = _BASE_PROMPT.search(text)
     return found[1] if found else ""
-
-
-def _read(path: Path) -> dict:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return data if isinstance(data, dict) else {}

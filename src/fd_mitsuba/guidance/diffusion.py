@@ -266,7 +266,6 @@ class DiffusionGuidance(Denoiser):
         config, bounds = self.config, self._how(phase).timestep_range
         progress, levels = min(step / max(steps_total - 1, 1), 1.0), len(self.alpha_bars)
         if config.timestep_annealing == "none":
-            bounds = sds.annealed_range(bounds, config.timestep_anneal, progress)
             timesteps = sds.draw_timesteps(bounds, levels, count, generator)
         else:
             timesteps = sds.scheduled_timesteps(bounds, levels, count, config.timestep_annealing, progress)

@@ -38,12 +38,6 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
     raise ValueError(f"unknown weighting {weighting!r}")
 
 
-def annealed_range(timestep_range: tuple[float, float], anneal: float, progress: float) -> tuple[float, float]:
-    """The range of t after its upper end came down by anneal * progress of the range's width; progress in [0, 1]."""
-    low, high = timestep_range
-    return low, high - anneal * progress * (high - low)
-
-
 def draw_timesteps(bounds: tuple[float, float], train_timesteps: int, count: int, generator: torch.Generator) -> Tensor:
     """`count` timesteps (int64, CPU), t ~ U[t_0, t_final] (paper, supplement "Score Distillation Sampling Settings").
 

@@ -27,7 +27,7 @@ from fd_mitsuba.prior.parts import PARTS
 from fd_mitsuba.prior.primitives import Solid, ellipsoid, rotation, transform
 from fd_mitsuba.render.tonemap import to_srgb
 
-TRAINING_SEED, UNSEEN_SEED, END_SEED = 3 * 2**30, 7 * 2**29, 2**32
+TRAINING_SEED, UNSEEN_SEED = 3 * 2**30, 7 * 2**29
 """The evaluator trains on seeds from the first and is judged from the second; the prior's are all below 3 * 2**30."""
 SIZE, SUPERSAMPLING, PATCH = 64, 2, 8
 STRETCH = 0.15

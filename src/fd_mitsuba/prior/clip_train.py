@@ -8,9 +8,7 @@ which body and part there are. And for most of the training it sees only the pat
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,7 @@ from fd_mitsuba.prior.clip_captions import Claim, true_of, write_caption
 from fd_mitsuba.prior.clip_corpus import TRAINING_SEED, render_shards
 from fd_mitsuba.prior.clip_model import WIDTH, build_clip, build_clip_tokenizer, save_evaluator
 from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
 
 KIND = "evaluator"
 DATA = Path("runs") / "clip_data" / "training"
@@ -154,9 +153,9 @@ def train_evaluator(
     Raises:
         UserError: the folder holds a training of something else or with other words.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    files = TrainingFolder(folder)
     torch.manual_seed(seed)
-    tokenizer, checkpoint = build_clip_tokenizer(), folder / "checkpoint.pt"
+    tokenizer, state = build_clip_tokenizer(), files.load()
     model = build_clip(tokenizer)
     heads = {"patch": len(PARTS) + 1, "part": len(PARTS) + 1, "body": len(BODIES)}
     aids = torch.nn.ModuleDict({name: torch.nn.Linear(WIDTH, count) for name, count in heads.items()})
@@ -164,22 +163,20 @@ def train_evaluator(
     optimiser = torch.optim.AdamW(modules.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.98), weight_decay=0.03)
     average, step = {k: v.clone() for k, v in model.state_dict().items() if v.is_floating_point()}, 0
     before = 0.0
-    if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True)
+    if state is not None:
         if state.get("kind") != KIND or state["vocabulary"] != tokenizer.get_vocab():
-            raise UserError(f"{checkpoint}: another kind of training, or other words; choose another folder")
+            raise UserError(f"{files.checkpoint}: another kind of training, or other words; choose another folder")
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
         average, step, before = state["average"], state["step"], state["seconds"]
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    shelf, started, saved, smooth = Shelf(data, seed * 7919 + step), time.time(), time.time(), None
+    shelf, started, smooth = Shelf(data, seed * 7919 + step), time.time(), None
 
     def save() -> None:
         state = {"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average}
         state |= {"step": step, "vocabulary": tokenizer.get_vocab(), "kind": KIND}
         state["seconds"] = before + time.time() - started
-        torch.save(state, folder / "checkpoint.tmp")
-        os.replace(folder / "checkpoint.tmp", checkpoint)
+        files.save(state)
 
     while step < total_steps and time.time() - started < seconds:
         progress = max(step / total_steps, (time.time() - started) / seconds)
@@ -205,12 +202,8 @@ def train_evaluator(
         optimiser.step()
         optimiser.zero_grad(set_to_none=True)
         step += 1
-        with torch.no_grad():
-            current, decay = model.state_dict(), min(0.995, step / (step + 10))
-            for key, value in average.items():
-                value.lerp_(current[key], 1 - decay)
-        now = (contrast.item(), aid.item())
-        smooth = now if smooth is None else tuple(0.97 * s + 0.03 * n for s, n in zip(smooth, now, strict=True))
+        follow(average, model, min(0.995, step / (step + 10)))
+        smooth = smoothed(smooth, (contrast.item(), aid.item()), 0.97)
         if step % 25 == 0:
             line = {"step": step, "contrast": round(smooth[0], 4), "aid": round(smooth[1], 4)}
             line |= {
@@ -218,11 +211,9 @@ def train_evaluator(
                 "shards": len(shelf),
                 "seconds": round(before + time.time() - started),
             }
-            with open(folder / "log.jsonl", "a", encoding="utf-8") as log:
-                log.write(json.dumps(line) + "\n")
-        if time.time() - saved > 300:
+            files.log(line)
+        if files.is_due():
             save()
-            saved = time.time()
     save()
 
 

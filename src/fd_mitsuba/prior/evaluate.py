@@ -47,9 +47,19 @@ class SampleFigures:
 @network_threads()
 @torch.no_grad()
 def draw_samples(
-    guidance: DiffusionGuidance, base: torch.Tensor, captions: list[str], seed: int, steps: int = 16, scale: float = 3.0
+    guidance: DiffusionGuidance,
+    base: torch.Tensor,
+    captions: list[str],
+    seed: int,
+    steps: int = 16,
+    scale: float = 3.0,
+    mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Clean latents (N, 4, 64, 64) after `steps` DDIM steps from noise, given the base's latents and full captions."""
+    """Clean latents (N, 4, 64, 64) after `steps` DDIM steps from noise, given the base's latents and full captions.
+
+    Args:
+        mask: (N, 1, 64, 64) of zeros and ones: where noise is; elsewhere the picture is the base's, at every step.
+    """
     generator = torch.Generator().manual_seed(seed)
     z = torch.randn(base.shape, generator=generator)
     passes = sds.cfg_coefficients_with_image(scale, 1.0)
@@ -57,9 +67,11 @@ def draw_samples(
     times = torch.linspace(len(guidance.alpha_bars) - 1, 0, steps + 1).round().long()
     for now, following in zip(times[:-1], times[1:], strict=True):
         repeated = now.repeat(len(base))
+        if mask is not None:
+            z = torch.where(mask > 0, z, guidance.alpha_bars[now].sqrt() * base)
         noise = sds.combine(guidance.predict_noise(z, repeated, texts, base), passes)
         z = sds.ddim_step(z, noise, guidance.alpha_bars[repeated], guidance.alpha_bars[following.repeat(len(base))])
-    return z
+    return z if mask is None else torch.where(mask > 0, z, base)
 
 
 def evaluate(
@@ -137,6 +149,3 @@ def picture(latent: np.ndarray) -> np.ndarray:
     """Colours (H, W, 3) uint8 of a geometry latent (4, H, W), on black."""
     mask = (latent[3:] + 1) / 2
     return (np.clip((latent[:3] + mask) / 2, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
-
-
-_colours = picture

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -21,20 +19,21 @@ from fd_mitsuba.prior.corpus import Pair
 from fd_mitsuba.prior.kinds import GEOMETRY, Kind
 from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, encode_text, load_packed
 from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
 
 OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
 """Bodies that most pictures show; the others keep the copying of the base general."""
 _BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
 _BODY_SHARES /= _BODY_SHARES.sum()
-THIN = ("horn", "handle", "skateboard", "glasses", "antlers")
-"""Parts of few pixels, drawn twice as often as the others."""
+PART_SHARES = {"horn": 3.0, "horns": 3.0, "flower": 3.0} | dict.fromkeys(("handle", "glasses", "antlers", "crown"), 2.0)
+"""How much more often than the others the parts of few pixels are drawn, and those that come out worst."""
 
 
 def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
     """The pairs of one random body with four of its parts, and now and then of the body alone; none of `HELD_OUT`."""
     body = str(rng.choice(list(BODIES), p=_BODY_SHARES))
     allowed = [part for part in PARTS if (body, part) not in HELD_OUT]
-    shares = np.array([2.0 if part in THIN else 1.0 for part in allowed])
+    shares = np.array([PART_SHARES.get(part, 1.0) for part in allowed])
     drawn = rng.choice(len(allowed), size=4, replace=False, p=shares / shares.sum())
     parts: list[str | None] = [allowed[i] for i in drawn]
     if rng.random() < 0.15:
@@ -94,43 +93,45 @@ def train(
     Args:
         folder: checkpoints and log; written every five minutes and at the end.
         kind: which prior.
-        init: optional folder of packed weights to start from instead of random ones.
+        init: optional folder of packed weights to start from instead of random ones; no step is small then.
         pairs: what to train on instead of freshly rendered pictures.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    files = TrainingFolder(folder)
     torch.manual_seed(seed)
-    scheduler, checkpoint = build_scheduler(kind.prediction), folder / "checkpoint.pt"
-    fresh = not checkpoint.exists()
+    scheduler, state = build_scheduler(kind.prediction), files.load()
     tokenizer = build_tokenizer()
     modules = kind.build_modules(tokenizer)
     encoder, unet = modules["text_encoder"], modules["unet"].to(memory_format=torch.channels_last)
-    if init is not None and fresh:
+    if init is not None and state is None:
         load_packed(init, modules, tokenizer, kind.prediction)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     optimiser = torch.optim.AdamW(
         modules.parameters(), lr=kind.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
     )
-    step = 0
-    if not fresh:
-        state = torch.load(checkpoint, weights_only=True)
+    step, small_steps = 0, 0 if init is not None else kind.small_steps
+    if state is not None:
         if state.get("kind", GEOMETRY.name) != kind.name:
-            raise UserError(f"{checkpoint}: a training of another kind; continue it with --kind {state.get('kind')}")
+            raise UserError(
+                f"{files.checkpoint}: a training of another kind; continue it with --kind {state.get('kind')}"
+            )
         if state["vocabulary"] != tokenizer.get_vocab():
-            raise UserError(f"{checkpoint}: trained with another vocabulary; pack it as it was and start with --init")
+            raise UserError(
+                f"{files.checkpoint}: trained with another vocabulary; pack it as it was and start with --init"
+            )
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
         average, step = state["average"], state["step"]
+        small_steps = state.get("small_steps", kind.small_steps)
     alphas = scheduler.alphas_cumprod
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     pool = Pool(kind, seed * 7919 + step) if pairs is None else pairs
     pool.refresh(min(600, total_steps * batch_size))
-    started, saved, smooth = time.time(), time.time(), None
+    started, smooth = time.time(), None
 
     def save() -> None:
         state = {"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average}
-        state |= {"step": step, "vocabulary": tokenizer.get_vocab(), "kind": kind.name}
-        torch.save(state, folder / "checkpoint.tmp")
-        os.replace(folder / "checkpoint.tmp", checkpoint)
+        state |= {"step": step, "vocabulary": tokenizer.get_vocab(), "kind": kind.name, "small_steps": small_steps}
+        files.save(state)
 
     while step < total_steps and time.time() - started < seconds:
         warm = min(1.0, (step + 1) / 150)
@@ -138,7 +139,7 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = rate
         base, edited, changed, captions = pool.batch(batch_size)
-        if step < kind.small_steps:
+        if step < small_steps:
             base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
             changed = (avg_pool2d(changed, 2) > 0.4).float()
         draw = torch.rand(batch_size, generator=generator).tolist()
@@ -161,14 +162,9 @@ def train(
         optimiser.step()
         optimiser.zero_grad(set_to_none=True)
         step += 1
-        decay = min(0.998, step / (step + 10))
-        with torch.no_grad():
-            state = modules.state_dict()
-            for key, value in average.items():
-                value.lerp_(state[key], 1 - decay)
+        follow(average, modules, min(0.998, step / (step + 10)))
         on_part = ((error * changed).sum() / (4 * changed.sum() + 1)).item()
-        now = (error.mean().item(), on_part)
-        smooth = now if smooth is None else tuple(0.98 * s + 0.02 * n for s, n in zip(smooth, now, strict=True))
+        smooth = smoothed(smooth, (error.mean().item(), on_part), 0.98)
         pool.refresh(kind.fresh_pairs)
         if step % 50 == 0:
             line = {
@@ -178,11 +174,9 @@ def train(
                 "rate": rate,
                 "seconds": round(time.time() - started),
             }
-            with open(folder / "log.jsonl", "a", encoding="utf-8") as log:
-                log.write(json.dumps(line) + "\n")
-        if time.time() - saved > 300:
+            files.log(line)
+        if files.is_due():
             save()
-            saved = time.time()
     save()
 
 

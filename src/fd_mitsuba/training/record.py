@@ -1,9 +1,11 @@
-"""What a run tells while it goes on: a progress line, `metrics.jsonl`, and contact sheets."""
+"""What a run tells while it goes on: a progress line, `metrics.jsonl`, contact sheets, its memory."""
 
 from __future__ import annotations
 
 import io
 import json
+import resource
+import sys
 import time
 from pathlib import Path
 from types import TracebackType
@@ -121,6 +123,12 @@ def write_picture(path: Path, image: Image.Image) -> None:
     data = io.BytesIO()
     image.save(data, format="PNG")
     write_atomically(path, data.getvalue())
+
+
+def peak_memory_mb() -> int:
+    """The most memory that this process has held so far, in units of 2^20 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
 def _short(value: float) -> float:

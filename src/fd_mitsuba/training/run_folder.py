@@ -18,6 +18,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.training.checkpoint import is_litter, list_checkpoints, write_atomically
+from fd_mitsuba.training.json_object import read_json_object
 
 _IDENTITY_NAME, _SETTINGS_NAME = "run.json", "config.json"
 _FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", "report.html", _IDENTITY_NAME)
@@ -144,11 +145,8 @@ def _flat(settings: dict) -> dict:
 
 
 def _read_json(path: Path) -> dict:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        data = None
-    if not isinstance(data, dict):
+    data = read_json_object(path)
+    if data is None:
         raise UserError(f"{path}: cannot be read, so the run cannot be resumed; choose another -o folder")
     return data
 
