@@ -99,6 +99,16 @@ def test_a_part_that_vanishes_stops_the_run(stage: Callable[..., GeometryStage])
             shrinker.check_field(step)
 
 
+def test_the_presence_loss_leaves_no_region_empty(stage: Callable[..., GeometryStage]) -> None:
+    """The pictures ask for no part at all, until nothing of it is left: without the loss, and not with it."""
+    shrinker = stage(-1.0, lambda_focal=0.0, lambda_sds=1e-3, lambda_presence=1e3, presence_share=0.1)
+    for step in range(60):
+        shrinker.step(step)
+    inside = shrinker.extractor.part_sdf(shrinker.field) > 0
+    room = shrinker.room[:, shrinker.extractor.active_index]
+    assert all(0 < float(inside[row].float().mean()) < 0.5 for row in room)
+
+
 def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., GeometryStage], tmp_path: Path) -> None:
     def run(first: int, resume: bool) -> list[int]:
         """The steps that were taken until the part had been invisible for too long, or a signal came."""

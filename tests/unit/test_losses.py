@@ -7,6 +7,7 @@ import torch
 
 from fd_mitsuba.losses.collision import loss_collision
 from fd_mitsuba.losses.focal import loss_focal
+from fd_mitsuba.losses.presence import loss_presence
 
 
 def test_focal_by_hand():
@@ -50,3 +51,18 @@ def test_no_samples_cost_nothing_and_give_finite_gradients():
     total = loss_focal(nothing, torch.empty(0), 0.05, 0.01) + loss_collision(torch.empty(0), nothing)
     total.backward()
     assert total.item() == 0
+
+
+def test_presence_by_hand():
+    sdf = torch.tensor([-0.3, -0.1, -0.2, 0.5, -0.4, 0.3])
+    members = torch.tensor([[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1], [0, 0, 0, 0, 0, 0]], dtype=torch.bool)
+    # First region: its two highest are -0.1 and -0.2; second: 0.5 and 0.3, deep enough; third: without points.
+    assert loss_presence(sdf, members, 0.5, 0.02).item() == pytest.approx((0.02 + 0.15) / 2)
+    assert loss_presence(sdf, members[2:], 0.5, 0.02).item() == 0
+
+
+def test_presence_lifts_the_deepest_points_of_an_empty_region_and_nothing_else():
+    sdf = torch.tensor([-0.3, -0.1, -0.2, -0.05], requires_grad=True)
+    members = torch.tensor([[True, True, True, False]])
+    loss_presence(sdf, members, 0.5, 0.01).backward()
+    assert sdf.grad.tolist() == pytest.approx([0, -0.5, -0.5, 0])

@@ -9,7 +9,7 @@ from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.prior import corpus
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.corpus import MosaicCamera, RayCaster, make_pairs, shade
-from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.parts import FEET, PARTS, resized
 from fd_mitsuba.prior.primitives import Solid, box, join
 from fd_mitsuba.scene.views import sample_views
 
@@ -57,7 +57,8 @@ def test_a_pair_differs_only_where_the_part_is() -> None:
     camera = corpus.global_camera(random)
     assert camera.azimuth_deg == overview.azimuth_deg
     origins, directions, rotations = camera.rays()
-    seen = shade(*RayCaster(PARTS[part](body, random)).cast(origins, directions), rotations)[3] > -127
+    solid = resized(part, PARTS[part](body, random), body, random)
+    seen = shade(*RayCaster(solid).cast(origins, directions), rotations)[3] > -127
     changed = (overview.base != overview.edited).any(0)
     assert changed.sum() > 20 and not (changed & ~seen).any()
     assert closeup.closeup and (closeup.base != closeup.edited).any(0).sum() > changed.sum()
@@ -119,3 +120,19 @@ def test_top_left_view_is_the_first_and_the_next_ones_turn_towards_plus_x(lopsid
     assert centre[0] > 18 and centre[2] < 13 and abs(centre[1] - 15.5) < 0.5 and abs(centre[3] - 15.5) < 0.5
     assert (right[3] > 0).sum() > (left[3] > 0).sum()  # nearer, so larger
     assert right[2, 16, 16] > 0.95  # it faces the viewer
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_resizing_keeps_a_parts_shape_and_where_it_sits(part: str) -> None:
+    random = np.random.default_rng(4)
+    body = BODIES["dog"](random)
+    before = PARTS[part](body, random)
+    after = resized(part, before, body, random)
+    if part not in FEET:
+        assert after is before
+        return
+    foot = FEET[part](body)
+    size = np.linalg.norm(after.vertices - foot, axis=1) / np.linalg.norm(before.vertices - foot, axis=1)
+    assert np.ptp(size) < 1e-9 and 0.65 <= size[0] <= 1.2
+    edges = [np.linalg.norm(s.vertices[s.faces[:, 0]] - s.vertices[s.faces[:, 1]], axis=1) for s in (before, after)]
+    assert np.allclose(edges[1], edges[0] * size[0])

@@ -14,7 +14,7 @@ import numpy as np
 from fd_mitsuba.mitsuba_api import start
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import caption, random_style, view_words
-from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.parts import PARTS, resized
 from fd_mitsuba.prior.primitives import Solid
 
 VIEW_SIZE = 32
@@ -150,7 +150,7 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
     base_caster, overview, pairs = RayCaster(made.solid), global_camera(rng), []
     overview_hits = None
     for part in parts:
-        solid = None if part is None else PARTS[part](made, rng)
+        solid = None if part is None else resized(part, PARTS[part](made, rng), made, rng)
         caster = None if solid is None else RayCaster(solid)
         cameras = [(overview, False)] if solid is None else [(overview, False), (closeup_camera(solid, rng), True)]
         for camera, closeup in cameras:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config_sections import AppearanceConfig
-from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.diffusion import MASK_THRESHOLD, DiffusionGuidance
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import BODY_WORDS, MATERIALS, PART_WORDS, styled, view_words
 from fd_mitsuba.prior.colour_corpus import PartView, part_views
@@ -40,13 +40,19 @@ class ColourFigure:
 
 
 def evaluate_colours(
-    folder: Path, output: Path, cases: Sequence[tuple[str, str, str]], seed: int = 0, steps: int = 12
+    folder: Path,
+    output: Path,
+    cases: Sequence[tuple[str, str, str]],
+    seed: int = 0,
+    steps: int = 12,
+    scale: float = 1.5,
 ) -> list[ColourFigure]:
     """Write `output` (a row each of clay, truth, sample for twelve cases) and measure.
 
     Args:
         folder: a packed pipeline folder of the appearance prior.
         cases: (body, part, style); a style is a key of `NAMED`.
+        steps, scale: of DDIM, and of the text guidance.
     """
     guidance = DiffusionGuidance.load(
         GuidanceConfig(model=str(folder), views_per_call=16), appearance=AppearanceConfig()
@@ -63,8 +69,13 @@ def evaluate_colours(
         coverages.append(painted[style][2])
         captions.append(f"{prompt(body, part, style)}, {view_words(view.camera.azimuth_deg, view.closeup)}")
     base = torch.from_numpy(np.stack(clay)).float() / 127
+    # As the guidance works: noise on the part alone.
+    mask = torch.from_numpy(np.stack(coverages)[:, None] > 255 * MASK_THRESHOLD).float()
     samples = torch.cat(
-        [draw_samples(guidance, base[i : i + 8], captions[i : i + 8], seed + i, steps) for i in range(0, len(base), 8)]
+        [
+            draw_samples(guidance, base[i : i + 8], captions[i : i + 8], seed + i, steps, scale, mask[i : i + 8])
+            for i in range(0, len(base), 8)
+        ]
     ).numpy()
     figures = []
     for case, truth, sample, coverage, picture in zip(cases, truths, samples, coverages, clay, strict=True):

@@ -22,6 +22,7 @@ from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
 from fd_mitsuba.losses.collision import loss_collision
 from fd_mitsuba.losses.focal import loss_focal
+from fd_mitsuba.losses.presence import loss_presence
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
@@ -34,6 +35,8 @@ from fd_mitsuba.training.step_views import check_views, step_views
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
+RIM_IN_CELLS = 2.0
+"""Within this distance of the base a part touches it: the soft union joins them."""
 EXPLODED_BEYOND = 1.0
 """A signed distance further than this from where it started, canonical units, is no shape any more."""
 
@@ -83,6 +86,7 @@ class GeometryStage:
         base = scene.base_canonical
         self.sdf_base = torch.from_numpy(base_sdf(points, base.vertices, base.faces))
         self.region_sdf = torch.from_numpy(union_sdf(scene.regions, points).astype(np.float32))
+        self.room = self._room(points)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.base_surface = self._base_surface()
@@ -201,11 +205,15 @@ class GeometryStage:
             losses["collision"] = loss_collision(self.sdf_base[samples], sdf_part)
         if geometry.lambda_volume > 0:
             losses["volume"] = (0.5 + sdf_part / (2 * self.grid.spacing)).clamp(0, 1).mean()
+        if geometry.lambda_presence > 0:
+            depth = 0.5 * self.grid.spacing
+            losses["presence"] = loss_presence(sdf_part, self.room[:, samples], geometry.presence_share, depth)
         return losses
 
     def _samples(self, step: int) -> Tensor | None:
         geometry = self.config.geometry
-        if geometry.lambda_focal == self.lambda_collision == geometry.lambda_volume == 0:
+        weights = (geometry.lambda_focal, self.lambda_collision, geometry.lambda_volume, geometry.lambda_presence)
+        if not any(weights):
             return None
         index = self.extractor.active_index
         if len(index) <= geometry.focal_samples:
@@ -244,6 +252,14 @@ class GeometryStage:
             passes.clear()
             passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
         return passes[phase]
+
+    def _room(self, points: np.ndarray) -> Tensor:
+        """Vertices (., V) that must hold some of the part, a row each: a focal region, or its rim along the base."""
+        inside = torch.from_numpy(np.stack([region.sdf(points) > 0 for region in self.scene.regions]))
+        if self.scene.subtracts:
+            return inside
+        outside = inside & (self.sdf_base < 0)
+        return torch.cat([outside, outside & (self.sdf_base > -RIM_IN_CELLS * self.grid.spacing)])
 
     def _extractor(self, active: Tensor) -> SurfaceExtractor:
         geometry = self.config.geometry
