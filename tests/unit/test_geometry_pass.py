@@ -230,6 +230,18 @@ def test_edges_of_closed_and_open_meshes() -> None:
         assert (np.sort(np.stack([start, end, opposite], 1)) == np.sort(faces[edges.half_a // 3])).all()
 
 
+def test_only_edges_of_closed_and_oriented_meshes_count_as_such() -> None:
+    faces = ball(2)[1].numpy()
+    turned = np.concatenate([faces[:1, ::-1], faces[1:]])
+    assert pair_half_edges(faces).is_oriented
+    for other in (turned, faces[1:], np.concatenate([faces, faces]), np.concatenate([faces, faces[:, ::-1]])):
+        assert not pair_half_edges(other).is_oriented
+    # With indices too large for the quick way, the slow one must find the same edges in the same order.
+    quick, slow = pair_half_edges(faces), pair_half_edges(faces + (1 << 30))
+    assert not slow.is_oriented
+    assert np.array_equal(quick.half_a, slow.half_a) and np.array_equal(quick.half_b, slow.half_b)
+
+
 def test_three_faces_at_one_edge() -> None:
     edges = pair_half_edges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert sorted(edges.half_b[edges.half_a % 3 == 0].tolist()) == [-1, 3]

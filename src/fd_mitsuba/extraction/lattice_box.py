@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.extraction.marching_tets import true_positions
 from fd_mitsuba.extraction.tet_grid import EDGE_SLOTS, TetGrid
 
 
@@ -50,8 +50,9 @@ class LatticeBox:
 
         Linear in the box's size, where sorting is not.
         """
-        marks = torch.zeros(len(self.vertices), dtype=torch.bool).index_fill_(0, local, True)
-        present = true_positions(marks)
+        marks = np.zeros(len(self.vertices), dtype=bool)
+        marks[local.numpy()] = True
+        present = torch.from_numpy(np.flatnonzero(marks))
         place_of = torch.empty(len(marks), dtype=torch.int64)
         place_of.index_copy_(0, present, torch.arange(len(present)))
         return present, place_of.index_select(0, local)

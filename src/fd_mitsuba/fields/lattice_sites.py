@@ -5,8 +5,10 @@ vertex once instead of eight times per site, and the interpolation becomes three
 
     box = (A_z x A_y x A_x) rows[slots],
 
-whose transposes are the backward pass. Slots and matrices are constants. Summing the gradient of vertices that share
-a row is a segmented sum in a fixed order, so repeated runs agree.
+whose transposes are the backward pass. Slots and matrices are constants. The product along z, which has the most
+results, comes last and leaves out the box's columns without a site: a third of them, around ellipsoids.
+
+Summing the gradient of vertices that share a row is a segmented sum in a fixed order, so repeated runs agree.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ class _BoxLevel:
     """Lattice vertices along z, y, x."""
     slots: Tensor
     """(z * y * x) table row of each lattice vertex, int64."""
+    in_columns: bool
+    """Whether along x and y lattice vertices are sites: then y and x are one, and hold the box's columns only."""
     order: Tensor
     """Lattice vertices sorted by row."""
     starts: Tensor
@@ -47,8 +51,12 @@ class _BoxLevel:
 class _Box:
     shape: tuple[int, int, int]
     """Sites along z, y, x."""
+    columns: Tensor
+    """(C,) the lines along z with a wanted site, each as y * width + x, ascending."""
+    spread: Tensor
+    """(height * width,) the place of each line in `columns`, C where it is not there."""
     inside: Tensor
-    """Position in the box of each wanted site."""
+    """Position of each wanted site, as z * C + place of its line in `columns`."""
     begin: int
     end: int
     levels: tuple[_BoxLevel, ...]
@@ -77,12 +85,16 @@ class LatticeSites:
             local = coordinates[members]
             low, high = local.amin(0), local.amax(0) + 1
             shape = tuple((high - low).tolist())
-            inside = ((local[:, 0] - low[0]) * shape[1] + local[:, 1] - low[1]) * shape[2] + local[:, 2] - low[2]
-            inside, order = inside.sort()
+            line = (local[:, 1] - low[1]) * shape[2] + local[:, 2] - low[2]
+            columns = line.unique()
+            spread = torch.full((shape[1] * shape[2],), len(columns)).index_copy_(
+                0, columns, torch.arange(len(columns))
+            )
+            inside, order = ((local[:, 0] - low[0]) * len(columns) + spread[line]).sort()
             chosen.append(index[members[order]])
             axes = [axis[low[i] : high[i]] for i in (2, 1, 0)]
-            levels = tuple(_box_level(grid, level, axes) for level in range(grid.levels))
-            self._boxes.append(_Box(shape, inside, begin, begin + len(local), levels))
+            levels = tuple(_box_level(grid, level, axes, columns) for level in range(grid.levels))
+            self._boxes.append(_Box(shape, columns, spread, inside, begin, begin + len(local), levels))
             begin += len(local)
         self.index = torch.cat(chosen) if chosen else index
 
@@ -95,14 +107,17 @@ class LatticeSites:
         pieces = [table.new_empty(self._grid_width, 0)]
         for box in self._boxes:
             depth, height, width = box.shape
-            full = table.new_empty(self._grid_width, depth * height * width)
+            full = table.new_empty(self._grid_width, depth * len(box.columns))
             for number, level in enumerate(box.levels):
                 along_x, along_y, along_z = level.matrices
-                values = table.index_select(1, level.slots).view(self._features, level.shape[0], -1)
-                values = _times(along_z, values).view(-1, level.shape[1], level.shape[2])
-                values = _times(along_y, values).view(-1, level.shape[2])
-                out = full[number * self._features : (number + 1) * self._features].view(-1, width)
-                out.copy_(values) if along_x is None else torch.mm(values, along_x.t(), out=out)
+                values = table.index_select(1, level.slots)
+                if not level.in_columns:
+                    values = _times_transposed(values.view(-1, level.shape[2]), along_x)
+                    values = _times(along_y, values.view(-1, level.shape[1], width))
+                    values = values.view(-1, height * width).index_select(1, box.columns)
+                values = values.view(self._features, level.shape[0], -1)
+                out = full[number * self._features : (number + 1) * self._features].view(self._features, depth, -1)
+                out.copy_(values) if along_z is None else torch.matmul(along_z, values, out=out)
             pieces.append(full.index_select(1, box.inside))
         return pieces[1] if len(pieces) == 2 else torch.cat(pieces, dim=1)
 
@@ -118,17 +133,22 @@ class LatticeSites:
             if first == last:
                 continue
             depth, height, width = box.shape
-            full = gradient.new_zeros(self._features, depth * height * width)
+            count = len(box.columns)
+            full = gradient.new_zeros(self._features, depth, count + 1)  # the last column serves lines without a site
             places = box.inside[chosen[first:last] - box.begin]
+            places = places + places // count
             for number, level in enumerate(box.levels):
                 along_x, along_y, along_z = level.matrices
                 # Every level fills the same places, so what lies between them stays 0.
                 rows = gradient[number * self._features : (number + 1) * self._features]
-                full.index_copy_(1, places, rows[:, first:last])
-                values = full.view(-1, width)
-                values = values if along_x is None else values @ along_x
-                values = _times(_transposed(along_y), values.view(-1, height, level.shape[2]))
-                values = _times(_transposed(along_z), values.view(self._features, depth, -1))
+                full.view(self._features, -1).index_copy_(1, places, rows[:, first:last])
+                values = _times(_transposed(along_z), full)
+                if level.in_columns:
+                    values = values[..., :count]
+                else:
+                    values = values.view(-1, count + 1).index_select(1, box.spread)
+                    values = _times(_transposed(along_y), values.view(-1, height, width)).view(-1, width)
+                    values = values if along_x is None else values @ along_x
                 values = values.reshape(self._features, -1)
                 for feature in range(self._features):
                     sums = embedding_bag(level.order, values[feature, :, None], level.starts, mode="sum")
@@ -154,6 +174,10 @@ def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
     return values if matrix is None else torch.matmul(matrix, values)
 
 
+def _times_transposed(values: Tensor, matrix: Tensor | None) -> Tensor:
+    return values if matrix is None else torch.mm(values, matrix.t())
+
+
 def _transposed(matrix: Tensor | None) -> Tensor | None:
     return None if matrix is None else matrix.t()
 
@@ -172,7 +196,7 @@ def _split(coordinates: Tensor, members: Tensor) -> list[Tensor]:
     return _split(coordinates, members[below]) + _split(coordinates, members[~below])
 
 
-def _box_level(grid: HashGrid, level: int, axes: list[Tensor]) -> _BoxLevel:
+def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) -> _BoxLevel:
     matrices, keys = [], []
     for number, coordinate in enumerate(axes):
         matrix, vertices = _axis_matrix(grid, level, coordinate)
@@ -181,12 +205,16 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor]) -> _BoxLevel:
         )
         matrices.append(None if is_identity else matrix.to(grid.table.dtype))
         keys.append(grid.axis_key(level, number, vertices))
-    slots = (keys[2][:, None, None] ^ keys[1][:, None] ^ keys[0]).reshape(-1) + grid.first_row[level]
+    slots = keys[2][:, None] ^ (keys[1][:, None] ^ keys[0]).reshape(-1)
+    in_columns = matrices[0] is None and matrices[1] is None
+    if in_columns:
+        slots = slots[:, columns]
+    slots = slots.reshape(-1) + grid.first_row[level]
     ordered, order = slots.sort(stable=True)
     used_rows, counts = ordered.unique_consecutive(return_counts=True)
     starts = counts.cumsum(0) - counts
     shape = (len(keys[2]), len(keys[1]), len(keys[0]))
-    return _BoxLevel((matrices[0], matrices[1], matrices[2]), shape, slots, order, starts, used_rows)
+    return _BoxLevel((matrices[0], matrices[1], matrices[2]), shape, slots, in_columns, order, starts, used_rows)
 
 
 def _axis_matrix(grid: HashGrid, level: int, coordinate: Tensor) -> tuple[Tensor, Tensor]:

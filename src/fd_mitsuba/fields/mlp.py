@@ -33,7 +33,7 @@ class ColumnMlp(nn.Module):
         return self.weight_out @ torch.relu(self.weight_in @ columns)
 
     @torch.no_grad()
-    def first_output(self, columns: Tensor, chunk: int = 8192) -> Tensor:
+    def first_output(self, columns: Tensor, chunk: int = 4096) -> Tensor:
         """Row 0 of the output, (N,), without gradients; in pieces that stay in the processor's cache."""
         outer = self.weight_out[:1]
         pieces = [outer @ torch.relu_(self.weight_in @ piece) for piece in columns.split(chunk, dim=1)]

@@ -17,6 +17,8 @@ class MeshEdges:
     """(E,) int64 half-edge of one face."""
     half_b: np.ndarray
     """(E,) int64 half-edge of the other face, -1 at a boundary edge."""
+    is_oriented: bool = False
+    """Whether it is known that every edge has two faces, which agree about the outside."""
 
     @property
     def face_a(self) -> np.ndarray:
@@ -52,6 +54,9 @@ def pair_half_edges(faces: np.ndarray, first: int = 0, others: np.ndarray | None
         first: the half-edges of the faces before this one are left out,
         others: except these.
     """
+    pairs = _pair_closed(faces, first, np.zeros(0, np.int64) if others is None else others)
+    if pairs is not None:
+        return pairs
     count = 3 * len(faces)
     half_edges = np.arange(3 * first, count, dtype=np.int64)
     start, end = faces[first:].reshape(-1), faces[first:][:, [1, 2, 0]].reshape(-1)
@@ -76,14 +81,49 @@ def pair_half_edges(faces: np.ndarray, first: int = 0, others: np.ndarray | None
     else:
         order = np.argsort(edge, kind="stable")
         edge, half_edges = edge[order], half_edges[order]
-    if len(edge) % 2 == 0 and np.array_equal(edge[::2], edge[1::2]) and (edge[2::2] != edge[1:-1:2]).all():
-        return MeshEdges(half_edges[::2], half_edges[1::2])  # closed and manifold: the same as below, sooner
     joined = np.append(edge[1:] == edge[:-1], False)  # this one and the next
     begins = np.flatnonzero(np.append(True, ~joined[:-1]))
     place = np.arange(len(edge)) - np.repeat(begins, np.diff(np.append(begins, len(edge))))
     first = np.flatnonzero(place % 2 == 0)
     following = half_edges[np.minimum(first + 1, len(edge) - 1)]
     return MeshEdges(half_edges[first], np.where(joined[first], following, -1))
+
+
+def _pair_closed(faces: np.ndarray, first: int, others: np.ndarray) -> MeshEdges | None:
+    """`pair_half_edges` of a closed, oriented mesh, in two thirds of the time; None where the mesh is not like that.
+
+    Of each edge's two half-edges one runs to the larger vertex and one to the smaller. Both kinds are sorted by edge,
+    one behind the other in the same array, and must then agree, which is also what `check_welded` asks for.
+    """
+    listed, count = len(others), len(others) + 3 * (len(faces) - first)
+    vertex_bits, half_bits = int(faces.max(initial=0)).bit_length(), max(3 * len(faces) - 1, 1).bit_length()
+    if count == 0 or count % 2 or 2 * vertex_bits + half_bits > 62:
+        return None
+    start, end = np.empty((2, count), np.int32 if vertex_bits < 32 else np.int64)
+    start[:listed], end[:listed] = _ends(faces.reshape(-1), others, others % 3)
+    own_start, own_end = start[listed:].reshape(-1, 3), end[listed:].reshape(-1, 3)
+    own_start[:] = faces[first:]
+    own_end[:, :2], own_end[:, 2] = own_start[:, 1:], own_start[:, 0]
+    is_downwards = start > end
+    half = count // 2
+    if np.count_nonzero(is_downwards) != half:
+        return None
+    key = is_downwards.astype(np.int64)
+    key <<= vertex_bits
+    key |= np.minimum(start, end)
+    key <<= vertex_bits
+    key |= np.maximum(start, end)
+    key <<= half_bits
+    key[:listed] |= others
+    key[listed:] |= np.arange(3 * first, 3 * len(faces))
+    key.sort()
+    upwards, downwards = key[:half], key[half:]
+    downwards -= 1 << (2 * vertex_bits + half_bits)
+    edge = upwards >> half_bits
+    if not np.array_equal(edge, downwards >> half_bits) or not (edge[1:] != edge[:-1]).all():
+        return None
+    key &= (1 << half_bits) - 1
+    return MeshEdges(np.minimum(upwards, downwards), np.maximum(upwards, downwards), is_oriented=True)
 
 
 class EdgeCache:
@@ -112,6 +152,8 @@ def check_welded(faces: np.ndarray, edges: MeshEdges) -> None:
     Raises:
         ValueError: most edges have one face only (vertices not welded), or neighbours disagree about the outside.
     """
+    if edges.is_oriented:
+        return
     closed = edges.half_b >= 0
     count = int(closed.sum())
     if len(faces) >= 100 and count < 0.5 * len(closed):

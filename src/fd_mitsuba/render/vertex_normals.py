@@ -1,7 +1,8 @@
 """Smooth vertex normals of a mesh, and their derivative, at the cost of the faces that change.
 
-torch, not Dr.Jit: its sums over the faces around each vertex sort first and add afterwards, which takes half the time
-of atomic additions and has a fixed order.
+torch and SciPy, not Dr.Jit, whose atomic additions take several times as long and have no fixed order. Vectors are
+columns here, all x first: sums at vertices are then sums of single numbers, one after another, which neither sort nor
+start a loop for each of them.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.sparse import csc_array
 from torch import Tensor
 
 _SMALLEST = 1e-36
@@ -34,10 +36,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor, fixed_sums: Tensor | None = 
 
 def area_sums(vertices: Tensor, faces: Tensor) -> Tensor:
     """The sums (V, 3) of face normals around each vertex, each as long as twice the face's area. No gradients."""
-    with torch.no_grad():
-        corners = _columns(faces)
-        normal = _cross(*_edges(vertices, corners))
-        return _sums(vertices, corners, (normal, normal, normal))
+    return _rows(_face_sums(len(vertices), faces, _cross(*_edges(vertices, _columns(faces)))))
 
 
 class _Normals(torch.autograd.Function):
@@ -45,34 +44,43 @@ class _Normals(torch.autograd.Function):
     def forward(ctx: Any, vertices: Tensor, faces: Tensor, fixed_sums: Tensor | None) -> Tensor:
         corners = _columns(faces)
         to_b, to_c = _edges(vertices, corners)
-        normal = _cross(to_b, to_c)
-        total = _sums(vertices, corners, (normal, normal, normal))
+        total = _face_sums(len(vertices), faces, _cross(to_b, to_c))
         if fixed_sums is not None:
-            total[: len(fixed_sums)] += fixed_sums
-        squared = torch.einsum("ni,ni->n", total, total)
-        inverse = squared.clamp(min=_SMALLEST).rsqrt()
-        normals = total * inverse[:, None]
+            total[:, : len(fixed_sums)] += _columns(fixed_sums)
+        squared = _dot(total, total)
+        inverse = squared.clamp(min=_SMALLEST).rsqrt_()
+        normals = total.mul_(inverse)
         if ctx.needs_input_grad[0]:
             inverse[squared < _SMALLEST] = 0
             ctx.save_for_backward(corners, to_b, to_c, normals, inverse)
-        return normals
+        return _rows(normals)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         corners, to_b, to_c, normals, inverse = ctx.saved_tensors
-        radial = torch.einsum("ni,ni->n", gradient, normals)
-        of_total = _columns((gradient - radial[:, None] * normals) * inverse[:, None])
+        of_total = _columns(gradient)
+        of_total = of_total.sub_(_dot(of_total, normals) * normals).mul_(inverse)
         of_normal = of_total.index_select(1, corners[0])
         of_normal += of_total.index_select(1, corners[1])
         of_normal += of_total.index_select(1, corners[2])
         of_b, of_c = _cross(to_c, of_normal), _cross(of_normal, to_b)
-        return _sums(gradient, corners, (-(of_b + of_c), of_b, of_c)), None, None
+        result = torch.zeros_like(of_total)
+        for axis, total in enumerate(result):
+            total.scatter_add_(0, corners[0], (of_b[axis] + of_c[axis]).neg_())
+            total.scatter_add_(0, corners[1], of_b[axis])
+            total.scatter_add_(0, corners[2], of_c[axis])
+        return _rows(result), None, None
 
 
 def _columns(rows: Tensor) -> Tensor:
-    """(N, 3) as a contiguous (3, N); NumPy copies this shape several times as fast as torch."""
-    return torch.from_numpy(np.ascontiguousarray(rows.detach().numpy().T))
+    """(N, 3) as a new contiguous (3, N); NumPy copies this shape several times as fast as torch."""
+    return torch.from_numpy(rows.detach().numpy().T.copy())
+
+
+def _rows(columns: Tensor) -> Tensor:
+    """(3, N) as a new contiguous (N, 3)."""
+    return torch.from_numpy(columns.numpy().T.copy())
 
 
 def _edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,19 +91,24 @@ def _edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """The cross products (F, 3) of vectors (3, F)."""
-    result = a.new_empty(a.shape[1], 3)
-    for axis in range(3):
+    """The cross products of vectors (3, F)."""
+    result = torch.empty_like(a)
+    for axis, out in enumerate(result):
         following, last = (axis + 1) % 3, (axis + 2) % 3
-        out = result[:, axis]
         torch.mul(a[following], b[last], out=out)
         out.addcmul_(a[last], b[following], value=-1)
     return result
 
 
-def _sums(like: Tensor, corners: Tensor, values: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """An array (V, 3) like the first, with the sums over the faces of `values` (F, 3) of each corner at its vertex."""
-    total = torch.zeros(like.shape, dtype=like.dtype)
-    for corner, value in zip(corners, values, strict=True):
-        total.scatter_add_(0, corner[:, None].expand(-1, 3), value)
-    return total
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """The dot products (N,) of vectors (3, N)."""
+    return (a[0] * b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])
+
+
+def _face_sums(count: int, faces: Tensor, values: Tensor) -> Tensor:
+    """The sums (3, count) at vertices of the `values` (3, F) of the faces (F, 3) around them, face after face."""
+    corners = faces.numpy().reshape(-1).astype(np.int32)
+    starts = np.arange(0, len(corners) + 1, 3, dtype=np.int32)
+    # Column f of the matrix has a one in the rows of face f's corners.
+    matrix = csc_array((np.ones(len(corners), values.numpy().dtype), corners, starts), shape=(count, len(faces)))
+    return torch.from_numpy(np.stack([matrix @ row for row in values.numpy()]))
