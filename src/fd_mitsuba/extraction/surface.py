@@ -28,7 +28,7 @@ from fd_mitsuba.extraction.marching_tets import (
     true_positions,
 )
 from fd_mitsuba.extraction.tet_grid import TetGrid
-from fd_mitsuba.fields.lattice_sites import LatticeSites
+from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.part_sdf import PartField, PartValues
 from fd_mitsuba.fields.union import soft_union
 
@@ -217,7 +217,7 @@ class SurfaceExtractor:
         self._static_faces = torch.searchsorted(self._static_edges, cell_edges)[faces]
         self._static_is_part = torch.zeros(len(faces), dtype=torch.bool)
 
-    def _part_at_sites(self, field: PartField) -> tuple[LatticeSites, Tensor, Tensor]:
+    def _part_at_sites(self, field: PartField) -> tuple[LatticeSites, SiteFeatures, Tensor]:
         if self._sites is None:
             self._sites = field.sites(self.grid.axis, self.active_index)
             self._site_base = self.sdf_base[self._sites.index]
@@ -237,7 +237,7 @@ class SurfaceExtractor:
         return crossing_faces(inside, self._box_cells)
 
     def _values_with_gradient(
-        self, field: PartField, sites: LatticeSites, features: Tensor, ends: Tensor, samples: Tensor | None
+        self, field: PartField, sites: LatticeSites, features: SiteFeatures, ends: Tensor, samples: Tensor | None
     ) -> tuple[PartValues, Tensor, Tensor]:
         """The field at the sites among `ends` and `samples` (one evaluation), and where each of them is in it.
 

@@ -13,6 +13,7 @@ Summing the gradient of vertices that share a row is a segmented sum in a fixed 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -62,6 +63,38 @@ class _Box:
     levels: tuple[_BoxLevel, ...]
 
 
+@dataclass(frozen=True)
+class SiteFeatures:
+    """The features of all sites for one state of the table, as they come out: whole columns of the boxes.
+
+    Copying them into the order of the sites takes as long as half a perceptron, and few are wanted twice.
+
+    Attributes:
+        none: (width, 0).
+        boxes: for each box its features (width, z * C), and the positions in it of the box's sites.
+    """
+
+    none: Tensor
+    boxes: list[tuple[Tensor, Tensor]]
+
+    def pieces(self, size: int) -> Iterator[Tensor]:
+        """The features of all sites in the order of `LatticeSites.index`, as (width, at most `size`)."""
+        for full, inside in self.boxes:
+            for places in inside.split(size):
+                yield full.index_select(1, places)
+
+    def columns(self, chosen: Tensor) -> Tensor:
+        """Those of the sites `chosen` (S,), ascending: (width, S)."""
+        ends = torch.tensor([len(inside) for _, inside in self.boxes], dtype=torch.int64).cumsum(0)
+        cuts = [0, *torch.searchsorted(chosen, ends).tolist()]
+        found = [self.none]
+        begin = 0
+        for (full, inside), first, last in zip(self.boxes, cuts[:-1], cuts[1:], strict=True):
+            found.append(full.index_select(1, inside[chosen[first:last] - begin]))
+            begin += len(inside)
+        return found[1] if len(found) == 2 else torch.cat(found, dim=1)
+
+
 class LatticeSites:
     """Constants for evaluating one hash grid at chosen vertices of a cubic lattice.
 
@@ -102,9 +135,9 @@ class LatticeSites:
         return len(self.index)
 
     @torch.no_grad()
-    def features(self, table: Tensor) -> Tensor:
-        """The features (levels * features, A) of all sites, in the order of `index`. No gradients."""
-        pieces = [table.new_empty(self._grid_width, 0)]
+    def features(self, table: Tensor) -> SiteFeatures:
+        """The features of all sites. No gradients."""
+        boxes = []
         for box in self._boxes:
             depth, height, width = box.shape
             full = table.new_empty(self._grid_width, depth * len(box.columns))
@@ -118,12 +151,12 @@ class LatticeSites:
                 values = values.view(self._features, level.shape[0], -1)
                 out = full[number * self._features : (number + 1) * self._features].view(self._features, depth, -1)
                 out.copy_(values) if along_z is None else torch.matmul(along_z, values, out=out)
-            pieces.append(full.index_select(1, box.inside))
-        return pieces[1] if len(pieces) == 2 else torch.cat(pieces, dim=1)
+            boxes.append((full, box.inside))
+        return SiteFeatures(table.new_empty(self._grid_width, 0), boxes)
 
-    def select(self, table: Tensor, features: Tensor, chosen: Tensor) -> Tensor:
-        """Columns `chosen` (ascending, unique) of `features(table)`, with gradients to `table`: (width, S)."""
-        return _Select.apply(table, features, chosen, self)
+    def select(self, table: Tensor, features: SiteFeatures, chosen: Tensor) -> Tensor:
+        """`features.columns(chosen)` of `features(table)`, with gradients to `table`; `chosen` ascending and unique."""
+        return _Select.apply(table, features.columns(chosen), chosen, self)
 
     def scatter_back(self, gradient: Tensor, chosen: Tensor) -> Tensor:
         """The gradient (features, rows) of the table from that of the chosen sites' features (width, S)."""
@@ -158,10 +191,10 @@ class LatticeSites:
 
 class _Select(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table: Tensor, features: Tensor, chosen: Tensor, sites: LatticeSites) -> Tensor:  # type: ignore[override]
+    def forward(ctx, table: Tensor, columns: Tensor, chosen: Tensor, sites: LatticeSites) -> Tensor:  # type: ignore[override]
         ctx.sites = sites
         ctx.save_for_backward(chosen)
-        return features.index_select(1, chosen)
+        return columns
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -33,8 +34,8 @@ class ColumnMlp(nn.Module):
         return self.weight_out @ torch.relu(self.weight_in @ columns)
 
     @torch.no_grad()
-    def first_output(self, columns: Tensor, chunk: int = 4096) -> Tensor:
-        """Row 0 of the output, (N,), without gradients; in pieces that stay in the processor's cache."""
+    def first_output(self, pieces: Iterable[Tensor]) -> Tensor:
+        """Row 0 of the output, (N,), without gradients, of input columns in pieces that fit the processor's cache."""
         outer = self.weight_out[:1]
-        pieces = [outer @ torch.relu_(self.weight_in @ piece) for piece in columns.split(chunk, dim=1)]
-        return torch.cat(pieces, dim=1)[0]
+        outputs = [outer.new_empty(1, 0), *(outer @ torch.relu_(self.weight_in @ piece) for piece in pieces)]
+        return torch.cat(outputs, dim=1)[0]

@@ -17,8 +17,11 @@ from torch import Tensor, nn
 from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.fields.hash_grid import HashGrid
-from fd_mitsuba.fields.lattice_sites import LatticeSites
+from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.mlp import ColumnMlp
+
+_PIECE = 4096
+"""Points at once, so that the perceptron's inputs and outputs stay in the processor's cache."""
 
 
 class PartValues(NamedTuple):
@@ -69,15 +72,17 @@ class PartField(nn.Module):
         """Constants that make `index` (A,) of a cubic lattice with coordinates `axis` (n,) fast to evaluate."""
         return LatticeSites(self.grid, axis, index)
 
-    def site_features(self, sites: LatticeSites) -> Tensor:
-        """The features (width, A) at all sites, without gradients."""
+    def site_features(self, sites: LatticeSites) -> SiteFeatures:
+        """The features at all sites, without gradients."""
         return sites.features(self.grid.table)
 
-    def site_sdf(self, features: Tensor, initial_sdf: Tensor) -> Tensor:
+    def site_sdf(self, features: SiteFeatures, initial_sdf: Tensor) -> Tensor:
         """`sdf_part` (A,) at all sites from their features, without gradients."""
-        return initial_sdf + self.mlp.first_output(features)
+        return initial_sdf + self.mlp.first_output(features.pieces(_PIECE))
 
-    def site_values(self, sites: LatticeSites, features: Tensor, chosen: Tensor, initial_sdf: Tensor) -> PartValues:
+    def site_values(
+        self, sites: LatticeSites, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor
+    ) -> PartValues:
         """The field at some sites, with gradients to the parameters.
 
         Args:
