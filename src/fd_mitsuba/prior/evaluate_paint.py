@@ -22,7 +22,7 @@ from fd_mitsuba.training.record import write_picture
 
 Case = tuple[str, str, str]
 LEAST_NEAREST = 0.85
-PAINT_SETTINGS = AppearanceConfig(timestep_range=(0.02, 0.98), weighting="sds", guidance_scale=3.0)
+PAINT_SETTINGS = AppearanceConfig(timestep_range=(0.02, 0.98), weighting="sds", guidance_scale=1.25)
 """Those of `configs/quick.toml` as far as guidance is concerned."""
 _METALS = ("gold", "silver")
 _NOT_METALS = ("wood", "plastic")
