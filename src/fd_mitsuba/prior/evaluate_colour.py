@@ -28,7 +28,7 @@ _ON_PART = 128
 class ColourFigure:
     """One sample: which of the anchors, painted on the same part under the same light, its mean colour is nearest to.
 
-    `error` is the distance in CIELAB to the prompted one; `base_kept` the mean change (sRGB) off the part.
+    `error` is the distance in CIELAB to the prompted one.
     """
 
     body: str
@@ -36,7 +36,6 @@ class ColourFigure:
     style: str
     nearest: str
     error: float
-    base_kept: float
 
 
 def evaluate_colours(
@@ -78,13 +77,12 @@ def evaluate_colours(
         ]
     ).numpy()
     figures = []
-    for case, truth, sample, coverage, picture in zip(cases, truths, samples, coverages, clay, strict=True):
+    for case, truth, sample, coverage in zip(cases, truths, samples, coverages, strict=True):
         on_part = coverage >= _ON_PART
         means = {name: _mean_lab(latent / 127, on_part) for name, latent in truth.items()}
         drawn = _mean_lab(sample, on_part)
         nearest = min(means, key=lambda name: float(np.linalg.norm(means[name] - drawn)))
-        change = np.abs(colours(sample) - colours(picture / 127))[coverage == 0].mean()
-        figures.append(ColourFigure(*case, nearest, float(np.linalg.norm(means[case[2]] - drawn)), float(change)))
+        figures.append(ColourFigure(*case, nearest, float(np.linalg.norm(means[case[2]] - drawn))))
     wanted = [truth[case[2]] / 127 for truth, case in zip(truths, cases, strict=True)]
     write_sheet(output, [[picture / 127 for picture in clay], wanted, list(samples)])
     return figures

@@ -58,8 +58,7 @@ def evaluate_paint(
     figures = evaluate_colours(folder, output, cases, seed, steps)
     report: dict = {
         "conditions": {"folder": str(folder), "seed": seed, "steps": steps, "paint_steps": paint_steps},
-        "sampled": nearest_shares([(figure.style, figure.nearest) for figure in figures])
-        | {"base_change": round(float(np.mean([figure.base_kept for figure in figures])), 4)},
+        "sampled": nearest_shares([(figure.style, figure.nearest) for figure in figures]),
         "samples": [asdict(figure) for figure in figures],
         "painted": None,
         "paintings": [],

@@ -25,7 +25,6 @@ from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.losses.presence import loss_presence
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.focal_region import union_sdf
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
@@ -85,8 +84,9 @@ class GeometryStage:
         points = self.grid.vertices.numpy()
         base = scene.base_canonical
         self.sdf_base = torch.from_numpy(base_sdf(points, base.vertices, base.faces))
-        self.region_sdf = torch.from_numpy(union_sdf(scene.regions, points).astype(np.float32))
-        self.room = self._room(points)
+        regions = torch.from_numpy(np.stack([region.sdf(points) for region in scene.regions]))
+        self.region_sdf = regions.amax(dim=0)
+        self.room = self._room(regions > 0)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.base_surface = self._base_surface()
@@ -185,7 +185,10 @@ class GeometryStage:
             )
         inside = float((sdf > 0).sum()) / max(float((start > 0).sum()), 1.0)
         if inside == 0.0:
-            raise RunStopped(f"step {step}: the part vanished; lower geometry.lambda_volume or guidance.guidance_scale")
+            raise RunStopped(
+                f"step {step}: the part vanished; raise geometry.lambda_presence, or lower geometry.lambda_volume or "
+                "guidance.guidance_scale"
+            )
         return {"volume_ratio": inside}
 
     def _sample_losses(self, sdf_part: Tensor, samples: Tensor) -> dict[str, Tensor]:
@@ -253,9 +256,8 @@ class GeometryStage:
             passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
         return passes[phase]
 
-    def _room(self, points: np.ndarray) -> Tensor:
+    def _room(self, inside: Tensor) -> Tensor:
         """Vertices (., V) that must hold some of the part, a row each: a focal region, or its rim along the base."""
-        inside = torch.from_numpy(np.stack([region.sdf(points) > 0 for region in self.scene.regions]))
         if self.scene.subtracts:
             return inside
         outside = inside & (self.sdf_base < 0)
