@@ -68,8 +68,8 @@ def test_the_seed_decides_the_start_and_leaves_the_global_state_alone():
 def every_column(sites: LatticeSites, grid: HashGrid) -> torch.Tensor:
     features = sites.features(grid.table)
     columns = features.columns(torch.arange(len(sites)))
-    pieces = [torch.empty(grid.width, 0, dtype=columns.dtype), *features.pieces(50)]
-    assert torch.equal(torch.cat(pieces, dim=1), columns)
+    for row in range(grid.width):
+        assert torch.equal(features.apply(lambda piece, row=row: piece[row], 50), columns[row])
     return columns
 
 
@@ -81,8 +81,10 @@ def test_sites_equal_the_plain_version(resolution):
     assert (every_column(sites, grid) - plain).abs().max() < 1e-6
 
 
-def test_sites_equal_the_plain_version_in_double_and_with_split_boxes(monkeypatch):
+@pytest.mark.parametrize("slab", [1, 50, 2**16])
+def test_sites_equal_the_plain_version_in_double_and_with_split_boxes(monkeypatch, slab):
     monkeypatch.setattr("fd_mitsuba.fields.lattice_sites._SMALLEST_BOX", 64)
+    monkeypatch.setattr("fd_mitsuba.fields.lattice_sites._SLAB", slab)
     grid, lattice = make_grid().double(), TetGrid(20)
     index = two_blobs(lattice)
     sites = LatticeSites(grid, lattice.axis, index)
@@ -113,4 +115,4 @@ def test_no_sites_give_no_features():
     grid, lattice = make_grid(), TetGrid(4)
     sites = LatticeSites(grid, lattice.axis, torch.empty(0, dtype=torch.int64))
     assert every_column(sites, grid).shape == (grid.width, 0)
-    assert not list(sites.features(grid.table).pieces(16))
+    assert len(sites.features(grid.table).apply(lambda piece: piece[0], 16)) == 0

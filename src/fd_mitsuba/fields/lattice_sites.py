@@ -6,14 +6,15 @@ vertex once instead of eight times per site, and the interpolation becomes three
     box = (A_z x A_y x A_x) rows[slots],
 
 whose transposes are the backward pass. Slots and matrices are constants. The product along z, which has the most
-results, comes last and leaves out the box's columns without a site: a third of them, around ellipsoids.
+results, comes last. It leaves out the box's columns without a site, a third of them around ellipsoids, and a large box
+is cut into slabs for it: a slab reads a few lattice planes of each level only, and its results stay in the cache.
 
 Summing the gradient of vertices that share a row is a segmented sum in a fixed order, so repeated runs agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,14 +27,16 @@ _SMALLEST_BOX = 32**3
 """Boxes below this number of sites are not split: a box costs about a millisecond whatever its size."""
 _FULL_ENOUGH = 0.4
 """Boxes filled at least to this share are not split; an ellipsoid fills 0.52 of its own."""
+_SLAB = 2**16
+"""Sites of a slab, at about."""
 _SNAP = 1e-9
 """Coordinates this close to a lattice plane lie on it, in cells; they need one vertex instead of two."""
 
 
 @dataclass(frozen=True)
 class _BoxLevel:
-    matrices: tuple[Tensor | None, Tensor | None, Tensor | None]
-    """Interpolation along x, y, z: (sites on the axis, lattice vertices on the axis); None: the identity."""
+    matrices: tuple[Tensor | None, Tensor | None]
+    """Interpolation along x and y: (sites on the axis, lattice vertices on the axis); None: the identity."""
     shape: tuple[int, int, int]
     """Lattice vertices along z, y, x."""
     slots: Tensor
@@ -46,50 +49,70 @@ class _BoxLevel:
     """Where each used row begins in `order`."""
     used_rows: Tensor
     """The rows, ascending, that the box reads."""
+    shares_rows: bool
+    """Whether several lattice vertices have the same row."""
+
+
+@dataclass(frozen=True)
+class _Slab:
+    depth: int
+    """Planes of sites."""
+    inside: Tensor
+    """Position of each wanted site, as z * C + place of its line in the box's `columns`; z counts from the slab."""
+    begin: int
+    end: int
+    """Its sites among all."""
+    levels: tuple[tuple[int, int, Tensor | None], ...]
+    """For each level the first lattice plane that it reads, the one after the last, and the interpolation between."""
 
 
 @dataclass(frozen=True)
 class _Box:
-    shape: tuple[int, int, int]
-    """Sites along z, y, x."""
+    height: int
+    width: int
+    """Sites along y and x."""
     columns: Tensor
     """(C,) the lines along z with a wanted site, each as y * width + x, ascending."""
     spread: Tensor
     """(height * width,) the place of each line in `columns`, C where it is not there."""
-    inside: Tensor
-    """Position of each wanted site, as z * C + place of its line in `columns`."""
-    begin: int
-    end: int
     levels: tuple[_BoxLevel, ...]
+    slabs: tuple[_Slab, ...]
 
 
 @dataclass(frozen=True)
 class SiteFeatures:
-    """The features of all sites for one state of the table, as they come out: whole columns of the boxes.
+    """The features of all sites for one state of the table, as they come out: whole columns of the slabs.
 
     Copying them into the order of the sites takes as long as half a perceptron, and few are wanted twice.
 
     Attributes:
         none: (width, 0).
-        boxes: for each box its features (width, z * C), and the positions in it of the box's sites.
+        slabs: for each slab its features (width, z * C), and the positions in it of the slab's sites.
     """
 
     none: Tensor
-    boxes: list[tuple[Tensor, Tensor]]
+    slabs: list[tuple[Tensor, Tensor]]
 
-    def pieces(self, size: int) -> Iterator[Tensor]:
-        """The features of all sites in the order of `LatticeSites.index`, as (width, at most `size`)."""
-        for full, inside in self.boxes:
-            for places in inside.split(size):
-                yield full.index_select(1, places)
+    def apply(self, function: Callable[[Tensor], Tensor], size: int) -> Tensor:
+        """`function` of the features of all sites, (A,) in the order of `LatticeSites.index`.
+
+        Args:
+            function: takes any N columns of features (width, N), N at most `size`, and returns (N,). It also sees the
+                places without a site: leaving them out costs more than they do.
+        """
+        outputs = [self.none[0]]
+        for full, inside in self.slabs:
+            of_slab = torch.cat([function(piece) for piece in full.split(size, dim=1)])
+            outputs.append(of_slab.index_select(0, inside))
+        return torch.cat(outputs)
 
     def columns(self, chosen: Tensor) -> Tensor:
         """Those of the sites `chosen` (S,), ascending: (width, S)."""
-        ends = torch.tensor([len(inside) for _, inside in self.boxes], dtype=torch.int64).cumsum(0)
+        ends = torch.tensor([len(inside) for _, inside in self.slabs], dtype=torch.int64).cumsum(0)
         cuts = [0, *torch.searchsorted(chosen, ends).tolist()]
         found = [self.none]
         begin = 0
-        for (full, inside), first, last in zip(self.boxes, cuts[:-1], cuts[1:], strict=True):
+        for (full, inside), first, last in zip(self.slabs, cuts[:-1], cuts[1:], strict=True):
             found.append(full.index_select(1, inside[chosen[first:last] - begin]))
             begin += len(inside)
         return found[1] if len(found) == 2 else torch.cat(found, dim=1)
@@ -117,17 +140,18 @@ class LatticeSites:
         for members in _split(coordinates, torch.arange(len(index))):
             local = coordinates[members]
             low, high = local.amin(0), local.amax(0) + 1
-            shape = tuple((high - low).tolist())
-            line = (local[:, 1] - low[1]) * shape[2] + local[:, 2] - low[2]
+            depth, height, width = (high - low).tolist()
+            line = (local[:, 1] - low[1]) * width + local[:, 2] - low[2]
             columns = line.unique()
-            spread = torch.full((shape[1] * shape[2],), len(columns)).index_copy_(
-                0, columns, torch.arange(len(columns))
-            )
+            spread = torch.full((height * width,), len(columns)).index_copy_(0, columns, torch.arange(len(columns)))
             inside, order = ((local[:, 0] - low[0]) * len(columns) + spread[line]).sort()
             chosen.append(index[members[order]])
             axes = [axis[low[i] : high[i]] for i in (2, 1, 0)]
-            levels = tuple(_box_level(grid, level, axes, columns) for level in range(grid.levels))
-            self._boxes.append(_Box(shape, columns, spread, inside, begin, begin + len(local), levels))
+            levels, along_z = zip(
+                *(_box_level(grid, level, axes, columns) for level in range(grid.levels)), strict=True
+            )
+            slabs = tuple(_slabs(depth, len(columns), inside, begin, along_z))
+            self._boxes.append(_Box(height, width, columns, spread, levels, slabs))
             begin += len(local)
         self.index = torch.cat(chosen) if chosen else index
 
@@ -137,22 +161,27 @@ class LatticeSites:
     @torch.no_grad()
     def features(self, table: Tensor) -> SiteFeatures:
         """The features of all sites. No gradients."""
-        boxes = []
+        slabs = []
         for box in self._boxes:
-            depth, height, width = box.shape
-            full = table.new_empty(self._grid_width, depth * len(box.columns))
-            for number, level in enumerate(box.levels):
-                along_x, along_y, along_z = level.matrices
-                values = table.index_select(1, level.slots)
-                if not level.in_columns:
-                    values = _times_transposed(values.view(-1, level.shape[2]), along_x)
-                    values = _times(along_y, values.view(-1, level.shape[1], width))
-                    values = values.view(-1, height * width).index_select(1, box.columns)
-                values = values.view(self._features, level.shape[0], -1)
-                out = full[number * self._features : (number + 1) * self._features].view(self._features, depth, -1)
-                out.copy_(values) if along_z is None else torch.matmul(along_z, values, out=out)
-            boxes.append((full, box.inside))
-        return SiteFeatures(table.new_empty(self._grid_width, 0), boxes)
+            planes = [self._planes(table, box, level) for level in box.levels]
+            for slab in box.slabs:
+                full = table.new_empty(self._grid_width, slab.depth, len(box.columns))
+                outputs = full.view(-1, self._features, *full.shape[1:])
+                for out, values, (first, last, along_z) in zip(outputs, planes, slab.levels, strict=True):
+                    values = values[:, first:last]
+                    out.copy_(values) if along_z is None else torch.matmul(along_z, values, out=out)
+                slabs.append((full.view(self._grid_width, -1), slab.inside))
+        return SiteFeatures(table.new_empty(self._grid_width, 0), slabs)
+
+    def _planes(self, table: Tensor, box: _Box, level: _BoxLevel) -> Tensor:
+        """A level's features (features, lattice planes, C) on the box's columns, interpolated along x and y."""
+        values = table.index_select(1, level.slots)
+        if not level.in_columns:
+            along_x, along_y = level.matrices
+            values = _times_transposed(values.view(-1, level.shape[2]), along_x)
+            values = _times(along_y, values.view(-1, level.shape[1], box.width))
+            values = values.view(-1, box.height * box.width).index_select(1, box.columns)
+        return values.view(self._features, level.shape[0], -1)
 
     def select(self, table: Tensor, features: SiteFeatures, chosen: Tensor) -> Tensor:
         """`features.columns(chosen)` of `features(table)`, with gradients to `table`; `chosen` ascending and unique."""
@@ -162,31 +191,50 @@ class LatticeSites:
         """The gradient (features, rows) of the table from that of the chosen sites' features (width, S)."""
         total = gradient.new_zeros(self._features, self._rows)
         for box in self._boxes:
-            first, last = torch.searchsorted(chosen, torch.tensor([box.begin, box.end])).tolist()
-            if first == last:
+            limits = torch.tensor([box.slabs[0].begin, *(slab.end for slab in box.slabs)])
+            cuts = torch.searchsorted(chosen, limits).tolist()
+            if cuts[0] == cuts[-1]:
                 continue
-            depth, height, width = box.shape
-            count = len(box.columns)
-            full = gradient.new_zeros(self._features, depth, count + 1)  # the last column serves lines without a site
-            places = box.inside[chosen[first:last] - box.begin]
-            places = places + places // count
-            for number, level in enumerate(box.levels):
-                along_x, along_y, along_z = level.matrices
-                # Every level fills the same places, so what lies between them stays 0.
-                rows = gradient[number * self._features : (number + 1) * self._features]
-                full.view(self._features, -1).index_copy_(1, places, rows[:, first:last])
-                values = _times(_transposed(along_z), full)
+            planes = self._planes_back(gradient, chosen, box, cuts)
+            for level, values in zip(box.levels, planes, strict=True):
                 if level.in_columns:
-                    values = values[..., :count]
+                    values = values[..., : len(box.columns)]
                 else:
-                    values = values.view(-1, count + 1).index_select(1, box.spread)
-                    values = _times(_transposed(along_y), values.view(-1, height, width)).view(-1, width)
+                    along_x, along_y = level.matrices
+                    values = values.view(-1, len(box.columns) + 1).index_select(1, box.spread)
+                    values = _times(_transposed(along_y), values.view(-1, box.height, box.width)).view(-1, box.width)
                     values = values if along_x is None else values @ along_x
                 values = values.reshape(self._features, -1)
                 for feature in range(self._features):
-                    sums = embedding_bag(level.order, values[feature, :, None], level.starts, mode="sum")
-                    total[feature].index_add_(0, level.used_rows, sums[:, 0])
+                    if level.shares_rows:
+                        sums = embedding_bag(level.order, values[feature, :, None], level.starts, mode="sum")
+                        total[feature].index_add_(0, level.used_rows, sums[:, 0])
+                    else:
+                        total[feature].index_add_(0, level.slots, values[feature])
         return total
+
+    def _planes_back(self, gradient: Tensor, chosen: Tensor, box: _Box, cuts: list[int]) -> list[Tensor]:
+        """Each level's gradient (features, lattice planes, C + 1); the last column, of lines without a site, is 0.
+
+        Args:
+            cuts: where in `chosen` the first slab begins and each ends.
+        """
+        count = len(box.columns)
+        planes = [gradient.new_zeros(self._features, level.shape[0], count + 1) for level in box.levels]
+        for slab, begin, end in zip(box.slabs, cuts[:-1], cuts[1:], strict=True):
+            full = gradient.new_zeros(self._features, slab.depth, count + 1)
+            places = slab.inside[chosen[begin:end] - slab.begin]
+            places = places + places // count
+            for number, (values, (first, last, along_z)) in enumerate(zip(planes, slab.levels, strict=True)):
+                # Every level fills the same places, so what lies between them stays 0.
+                rows = gradient[number * self._features : (number + 1) * self._features]
+                full.view(self._features, -1).index_copy_(1, places, rows[:, begin:end])
+                values = values[:, first:last]
+                if along_z is None:
+                    values += full
+                else:
+                    torch.baddbmm(values, along_z.t().expand(self._features, -1, -1), full, out=values)
+        return planes
 
 
 class _Select(torch.autograd.Function):
@@ -229,7 +277,8 @@ def _split(coordinates: Tensor, members: Tensor) -> list[Tensor]:
     return _split(coordinates, members[below]) + _split(coordinates, members[~below])
 
 
-def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) -> _BoxLevel:
+def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) -> tuple[_BoxLevel, Tensor | None]:
+    """A level's constants, and its interpolation along z (sites, lattice planes); None: the identity."""
     matrices, keys = [], []
     for number, coordinate in enumerate(axes):
         matrix, vertices = _axis_matrix(grid, level, coordinate)
@@ -247,7 +296,29 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) 
     used_rows, counts = ordered.unique_consecutive(return_counts=True)
     starts = counts.cumsum(0) - counts
     shape = (len(keys[2]), len(keys[1]), len(keys[0]))
-    return _BoxLevel((matrices[0], matrices[1], matrices[2]), shape, slots, in_columns, order, starts, used_rows)
+    box_level = _BoxLevel(
+        (matrices[0], matrices[1]), shape, slots, in_columns, order, starts, used_rows, len(used_rows) < len(slots)
+    )
+    return box_level, matrices[2]
+
+
+def _slabs(depth: int, columns: int, inside: Tensor, begin: int, along_z: Sequence[Tensor | None]) -> Iterator[_Slab]:
+    """A box's slabs from the top down: `inside` (A,) ascending as in `_Slab`, but z counts from the box."""
+    planes = -(-depth // max(1, round(depth * columns / _SLAB)))
+    for top in range(0, depth, planes):
+        bottom = min(top + planes, depth)
+        first, last = torch.searchsorted(inside, torch.tensor([top * columns, bottom * columns])).tolist()
+        levels = tuple(_band(matrix, top, bottom) for matrix in along_z)
+        yield _Slab(bottom - top, inside[first:last] - top * columns, begin + first, begin + last, levels)
+
+
+def _band(matrix: Tensor | None, top: int, bottom: int) -> tuple[int, int, Tensor | None]:
+    """The columns of these rows that are not all 0, as first, one after the last, and what is between."""
+    if matrix is None:
+        return top, bottom, None
+    used = (matrix[top:bottom] != 0).any(dim=0).nonzero()[:, 0]
+    first, last = int(used[0]), int(used[-1]) + 1
+    return first, last, matrix[top:bottom, first:last].contiguous()
 
 
 def _axis_matrix(grid: HashGrid, level: int, coordinate: Tensor) -> tuple[Tensor, Tensor]:

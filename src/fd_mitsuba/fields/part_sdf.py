@@ -78,7 +78,7 @@ class PartField(nn.Module):
 
     def site_sdf(self, features: SiteFeatures, initial_sdf: Tensor) -> Tensor:
         """`sdf_part` (A,) at all sites from their features, without gradients."""
-        return initial_sdf + self.mlp.first_output(features.pieces(_PIECE))
+        return initial_sdf + features.apply(self.mlp.first_output, _PIECE)
 
     def site_values(
         self, sites: LatticeSites, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor
@@ -95,5 +95,5 @@ class PartField(nn.Module):
         return self._values(self.mlp(columns), initial_sdf)
 
     def _values(self, rows: Tensor, initial_sdf: Tensor) -> PartValues:
-        offset = torch.tanh(rows[1:]).t() if self.offsets else torch.zeros_like(rows[1:]).t()
-        return PartValues(initial_sdf + rows[0], offset)
+        logits = rows[1:].t().contiguous()  # one point after another: callers pick points
+        return PartValues(initial_sdf + rows[0], torch.tanh(logits) if self.offsets else torch.zeros_like(logits))

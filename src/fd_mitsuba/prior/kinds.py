@@ -44,6 +44,8 @@ class Kind:
         text_width, text_layers: of the text encoder.
         learning_rate: at its highest, after the warm-up.
         part_weight: extra loss weight of the part's pixels: they are few, and the rest is a copy.
+        copy_weight: weight of the absolute error where the part is not, beside the squared one: small errors of a copy
+            hardly count when squared, and where a part is unlikely the base itself is the better guess than their mean.
         tint_weight: extra loss weight of colour as against brightness, which four correlated channels share.
         time_power: t = 1000 u^time_power for uniform u; below 1 draws high noise more often.
         fresh_pairs: new training pairs a step.
@@ -63,6 +65,7 @@ class Kind:
     text_layers: int
     learning_rate: float
     part_weight: float
+    copy_weight: float
     tint_weight: float
     time_power: float
     fresh_pairs: int
@@ -93,6 +96,7 @@ GEOMETRY = Kind(
     text_layers=2,
     learning_rate=6e-4,
     part_weight=4.0,
+    copy_weight=0.1,
     tint_weight=0.0,
     time_power=0.75,
     fresh_pairs=8,
@@ -111,6 +115,7 @@ APPEARANCE = Kind(
     text_layers=1,
     learning_rate=1.5e-3,
     part_weight=8.0,
+    copy_weight=0.0,
     tint_weight=4.0,
     time_power=0.6,
     fresh_pairs=4,

@@ -25,7 +25,9 @@ OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
 """Bodies that most pictures show; the others keep the copying of the base general."""
 _BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
 _BODY_SHARES /= _BODY_SHARES.sum()
-PART_SHARES = {"horn": 3.0, "horns": 3.0, "flower": 3.0} | dict.fromkeys(("handle", "glasses", "antlers", "crown"), 2.0)
+PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0) | dict.fromkeys(
+    ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
+)
 """How much more often than the others the parts of few pixels are drawn, and those that come out worst."""
 
 
@@ -157,6 +159,8 @@ def train(
         predicted = unet(condition, times, encode_text(tokenizer, encoder, captions)).sample
         error = squared_error(predicted - target, kind.tint_weight)
         loss = (error * (1 + kind.part_weight * changed)).mean()
+        if kind.copy_weight:
+            loss = loss + kind.copy_weight * ((predicted - target).abs() * (1 - changed)).mean()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
         optimiser.step()
