@@ -32,7 +32,7 @@ demo: $(STAMP) llvm
 	@echo "look at $(OUT)/images/turntable.png (shape) and images/appearance.png (material); $(OUT)/export/asset.glb opens in Blender"
 
 test: $(STAMP) llvm
-	$(PY) -m pytest $(PYTEST_ARGS)
+	$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
 bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json
