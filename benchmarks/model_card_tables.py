@@ -55,7 +55,7 @@ def runs_table(report: dict) -> list[str]:
 
 
 def colours_table(report: dict) -> list[str]:
-    """A row for samples and for painted parts, then how metallic they became."""
+    """A row for samples and for painted parts, then how metallic and rough they became."""
     lines = ["| | prompts | nearest | of colours | of materials |", "|---|---|---|---|---|"]
     for name in ("sampled", "painted"):
         row = report[name]
@@ -63,8 +63,9 @@ def colours_table(report: dict) -> list[str]:
             cells = [share(row[key]) for key in ("all", "colours", "materials")]
             lines.append(f"| {name} | {row['prompts']} | {' | '.join(cells)} |")
     if report["painted"]:
-        metals = ", ".join(f"{name} {value:.2f}" for name, value in report["painted"]["metallic"].items())
-        lines += ["", f"Metallic of painted parts: {metals}."]
+        for channel in ("metallic", "roughness"):
+            means = ", ".join(f"{name} {value:.2f}" for name, value in report["painted"][channel].items())
+            lines += ["", f"Mean {channel} of painted parts: {means}."]
     return lines
 
 

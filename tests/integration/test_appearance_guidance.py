@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -57,7 +58,8 @@ def views_of(guidance: DiffusionGuidance, count: int = 4, size: int | None = Non
     mask[..., size // 8 :, :] = 1
     part[..., size // 4 : size // 2, : size // 4] = 1
     azimuths = [10.0 + 90 * index for index in range(count)]
-    return AppearanceViews((pictures * mask).requires_grad_(), condition * mask, mask, part, azimuths, [20.0] * count)
+    pictures, shine = (pictures * mask).requires_grad_(), (0.3 * part).requires_grad_()
+    return AppearanceViews(pictures, condition * mask, mask, part, shine, azimuths, [20.0] * count)
 
 
 def gradient_of(guidance: DiffusionGuidance, views: AppearanceViews, step: int = 0, seed: int = 3) -> torch.Tensor:
@@ -110,6 +112,20 @@ def test_a_masked_gradient_stays_on_the_part(folders: dict[str, Path], kind: str
         assert inside[~part].mean() < 0.3 * inside[part].mean()
 
 
+@pytest.mark.parametrize("kind", ["builtin", "ip2p"])
+def test_only_a_model_that_knows_shine_is_told_of_it_and_asks_for_it(folders: dict[str, Path], kind: str) -> None:
+    guidance = load(folders[kind])
+    views = views_of(guidance)
+    result = guidance.guide_appearance(views, 0, 10, 3)
+    of_pictures, of_shine = torch.autograd.grad(result.loss, (views.pictures, views.shine), allow_unused=True)
+    if kind == "ip2p":
+        assert of_shine is None
+        return
+    assert of_shine[views.part_mask > 0].abs().mean() > 0 and (of_shine[views.part_mask == 0] == 0).all()
+    other = replace(views, shine=views.shine * 2)
+    assert not gradient_of(guidance, other).equal(of_pictures)
+
+
 def test_a_part_out_of_sight_gives_no_gradient(folders: dict[str, Path]) -> None:
     guidance = load(folders["builtin"])
     guidance.config = guidance.config.model_copy(update={"normalise_gradient": True})
@@ -123,10 +139,11 @@ def test_a_part_out_of_sight_gives_no_gradient(folders: dict[str, Path]) -> None
 
 def test_area_means_equal_the_packed_vae(folders: dict[str, Path]) -> None:
     guidance = load(folders["builtin"])
-    mosaic = torch.rand(2, 3, 512, 512, generator=torch.Generator().manual_seed(1))
+    mosaic = torch.rand(2, 4, 512, 512, generator=torch.Generator().manual_seed(1))
+    mosaic[:, 3] = 0  # the VAE knows no shine
     with torch.no_grad():
         direct = guidance.encode(mosaic, "appearance")
-        encoded = guidance.components.vae.encode(2 * mosaic - 1).latents
+        encoded = guidance.components.vae.encode(2 * mosaic[:, :3] - 1).latents
     assert direct.shape == (2, 4, 64, 64)
     torch.testing.assert_close(direct, encoded, atol=2e-3, rtol=0)  # the folder's weights are half precision
 
@@ -137,7 +154,7 @@ def test_pictures_of_another_size_are_resized(folders: dict[str, Path], kind: st
     small = views_of(guidance)
     double = AppearanceViews(
         *(getattr(small, name).detach().repeat_interleave(2, 2).repeat_interleave(2, 3)
-          for name in ("pictures", "condition", "mask", "part_mask")),
+          for name in ("pictures", "condition", "mask", "part_mask", "shine")),
         small.azimuth_deg, small.elevation_deg,
     )  # fmt: skip
     double.pictures.requires_grad_()
@@ -162,11 +179,11 @@ def test_the_condition_and_the_prompt_matter(folders: dict[str, Path]) -> None:
 def test_bad_views_are_refused(folders: dict[str, Path]) -> None:
     guidance = load(folders["builtin"])
     views = views_of(guidance)
-    bare = AppearanceViews(views.pictures, None, views.mask, views.part_mask, views.azimuth_deg, views.elevation_deg)
+    bare = replace(views, condition=None)
     with pytest.raises(ValueError, match="needs the base's pictures"):
         guidance.guide_appearance(bare, 0, 10, 0)
     with pytest.raises(ValueError, match="part_mask must be"):
-        AppearanceViews(views.pictures, None, views.mask, views.mask[:1], views.azimuth_deg, views.elevation_deg)
+        replace(views, part_mask=views.mask[:1])
     views.pictures.data[0, 0, 0, 0] = math.nan
     with pytest.raises(NonFiniteGuidance, match="appearance phase are not finite"):
         guidance.guide_appearance(views, 0, 10, 0)

@@ -41,6 +41,14 @@ class AskForColour:
         return GuidanceResult(wrong.sum() / views.part_mask.sum().clamp(min=1))
 
 
+class AskForShine(AskForColour):
+    """Wants the part to be a mirror, and does not care for its colour."""
+
+    def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
+        wrong = (views.shine - views.part_mask).square().sum() / views.part_mask.sum().clamp(min=1)
+        return GuidanceResult(wrong + 0 * views.pictures.sum())
+
+
 @pytest.fixture
 def scene(make_scene: Callable[..., Path]) -> EditScene:
     return load_edit_scene(make_scene())
@@ -75,6 +83,22 @@ def mean_colour(stage: AppearanceStage) -> torch.Tensor:
 def test_the_part_takes_the_colour_that_is_asked_for(scene: EditScene, lump: SimpleNamespace) -> None:
     red, green, blue = mean_colour(trained(scene, lump))
     assert red > 2.5 * green and red > 2.5 * blue
+
+
+@pytest.mark.parametrize("fixed", [[], ["metallic"]])
+def test_a_part_that_is_asked_to_shine_becomes_smooth_metal(
+    scene: EditScene, lump: SimpleNamespace, fixed: list[str]
+) -> None:
+    stage = AppearanceStage(scene, settings(fixed=fixed), {"part": lump}, AskForShine(RED), lambda line: None)
+    before = stage.check_field(0)
+    for step in range(stage.steps):
+        stage.step(step)
+    after = stage.check_field(0)
+    if fixed:  # roughness alone cannot make metal of it, and is left alone
+        assert after["mean_roughness"] == pytest.approx(before["mean_roughness"], abs=1e-3)
+    else:
+        assert after["mean_roughness"] < before["mean_roughness"] - 0.1
+        assert after["mean_metallic"] > before["mean_metallic"] + 0.1
 
 
 def test_style_consistency_ties_the_part_to_the_base(scene: EditScene, lump: SimpleNamespace) -> None:

@@ -19,7 +19,7 @@ from fd_mitsuba.prior.paint_check import paint
 
 
 class _Green(torch.nn.Module):
-    """Takes every picture for a noisy one of plain green."""
+    """Takes every picture for a noisy one of plain green metal."""
 
     dtype = torch.float32
 
@@ -28,7 +28,7 @@ class _Green(torch.nn.Module):
         self.config = like.config
 
     def forward(self, inputs: torch.Tensor, t: torch.Tensor, **_: object) -> tuple[torch.Tensor]:
-        green = torch.tensor([0.1, 0.5, 0.15]).view(1, 3, 1, 1).expand(len(inputs), 3, 64, 64)
+        green = torch.tensor([0.1, 0.5, 0.15, 0.9]).view(1, 4, 1, 1).expand(len(inputs), 4, 64, 64)
         return (colour_latents(green, 64),)
 
 
@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "weights"
 
 
-def test_a_part_takes_the_colour_that_the_network_sees(folder: Path) -> None:
+def test_a_part_takes_the_colour_and_the_shine_that_the_network_sees(folder: Path) -> None:
     settings = AppearanceConfig(weighting="sds", guidance_scale=1.0, timestep_range=(0.3, 0.7))
     config = GuidanceConfig(model=str(folder), normalise_gradient=True)
     guidance = DiffusionGuidance.load(config, appearance=settings)
@@ -51,5 +51,6 @@ def test_a_part_takes_the_colour_that_the_network_sees(folder: Path) -> None:
     assert before.nearest != "green" and after.nearest == "green"
     red, green, blue = after.seen
     assert green > 1.3 * red and green > 1.3 * blue
+    assert before.metallic < 0.1 < after.metallic - 0.2 and after.roughness < before.roughness - 0.2
     assert len(after.pictures) == 5 and after.pictures[0].shape == (3, 128, 128)
     assert after.speckle < 25

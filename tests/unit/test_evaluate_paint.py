@@ -6,8 +6,8 @@ from fd_mitsuba.prior.evaluate_paint import nearest_shares, painted_figures
 from fd_mitsuba.prior.paint_check import Painted
 
 
-def painted(nearest: str, metallic: float) -> Painted:
-    return Painted((0.5, 0.5, 0.5), nearest, (0.5, 0.5, 0.5), metallic, 1.0, [])
+def painted(nearest: str, metallic: float, roughness: float = 0.6) -> Painted:
+    return Painted((0.5, 0.5, 0.5), nearest, (0.5, 0.5, 0.5), roughness, metallic, 1.0, [])
 
 
 def test_shares_of_colours_and_materials() -> None:
@@ -18,7 +18,7 @@ def test_shares_of_colours_and_materials() -> None:
 
 def test_metals_must_become_metallic_and_others_not() -> None:
     done = [
-        (("cat", "crown", "gold"), painted("gold", 0.8)),
+        (("cat", "crown", "gold"), painted("gold", 0.8, 0.2)),
         (("cat", "horn", "gold"), painted("yellow", 0.4)),
         (("cat", "horn", "silver"), painted("silver", 0.2)),
         (("cat", "horn", "wood"), painted("wood", 0.1)),
@@ -27,3 +27,5 @@ def test_metals_must_become_metallic_and_others_not() -> None:
     figures = painted_figures(done)
     assert figures["metallic"] == {"gold": 0.6, "silver": 0.2, "wood": 0.1} and figures["all"] == 0.8
     assert figures["metallic_right"] == {"gold": True, "silver": False, "wood": True}
+    assert figures["roughness"] == {"gold": 0.4, "silver": 0.6, "wood": 0.6}
+    assert figures["roughness_right"] == {"gold": True, "silver": False, "wood": True}

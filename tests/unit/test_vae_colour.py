@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
-from fd_mitsuba.guidance.colour_latents import LUMA, colour_latents
+from fd_mitsuba.guidance.colour_latents import colour_latents, shine
 from fd_mitsuba.prior.vae_colour import build_colour_vae
 
 
@@ -15,15 +15,21 @@ def picture(size: int = 64, seed: int = 0) -> torch.Tensor:
 
 
 @torch.no_grad()
-def test_encoder_averages_colours_and_luma() -> None:
+def test_encoder_averages_colours_and_knows_no_shine() -> None:
     colour = picture()
     latents = build_colour_vae().encode(2 * colour - 1).latents
     means = avg_pool2d(colour, 8)
-    luma = sum(weight * means[:, k : k + 1] for k, weight in enumerate(LUMA))
-    torch.testing.assert_close(latents, 2 * torch.cat([means, luma], 1) - 1, atol=1e-5, rtol=0)
-    torch.testing.assert_close(colour_latents(colour, 8), latents, atol=1e-5, rtol=0)
+    dull = torch.zeros_like(means[:, :1])
+    torch.testing.assert_close(latents, 2 * torch.cat([means, dull], 1) - 1, atol=1e-5, rtol=0)
+    shown = torch.cat([colour, torch.zeros_like(colour[:, :1])], 1)
+    torch.testing.assert_close(colour_latents(shown, 8), latents, atol=1e-5, rtol=0)
     for size in (8, 16, 32):  # a picture of another size has the same means
-        torch.testing.assert_close(colour_latents(avg_pool2d(colour, 64 // size), 8), latents, atol=1e-5, rtol=0)
+        torch.testing.assert_close(colour_latents(avg_pool2d(shown, 64 // size), 8), latents, atol=1e-5, rtol=0)
+
+
+def test_nothing_but_metal_shines_more_than_a_fifth() -> None:
+    assert shine(torch.tensor(0.0), torch.tensor(1.0)) == 1 and shine(torch.tensor(1.0), torch.tensor(0.0)) == 0
+    assert shine(torch.rand(50), torch.zeros(50)).max() <= 0.2
 
 
 @torch.no_grad()
@@ -31,7 +37,7 @@ def test_black_stays_black_and_white_white() -> None:
     vae = build_colour_vae()
     for value in (0.0, 1.0):
         flat = torch.full((1, 3, 64, 64), value)
-        assert torch.allclose(vae.encode(2 * flat - 1).latents, torch.tensor(2 * value - 1), atol=1e-5)
+        assert torch.allclose(vae.encode(2 * flat - 1).latents[:, :3], torch.tensor(2 * value - 1), atol=1e-5)
 
 
 @torch.no_grad()

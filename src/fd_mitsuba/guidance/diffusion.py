@@ -38,7 +38,7 @@ class DiffusionGuidance(Denoiser):
     A UNet with 8 input channels sees the base's latents of the same view beside z_t and takes `image_guidance_scale` as
     second scale. In the coarse phase (normal times coverage, 2 mask - 1) stands for scaled latents; in the refined
     phase the normals, as colours on black, go through the VAE encoder (its mean: only t and the noise are random), and
-    so do the colours of the appearance stage, unless the model's conventions say `area_mean`.
+    so do the colours of the appearance stage, unless the model's conventions say `area_mean_shine`.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class DiffusionGuidance(Denoiser):
         self.view_grid = components.conventions.view_grid
         self.normal_space = components.conventions.normal_space
         vae = components.vae.config
+        self._sees_shine = components.conventions.latents == "area_mean_shine"
         self.vae_scale_factor = 2 ** (len(vae.get("encoder_block_out_channels") or vae.block_out_channels) - 1)
         self.scaling_factor = float(vae.get("scaling_factor") or 1.0)
         self.shift_factor = float(vae.get("shift_factor") or 0.0)
@@ -83,7 +84,7 @@ class DiffusionGuidance(Denoiser):
 
     def picture_size(self, phase: Phase) -> int:
         """Side in pixels of one view: the latents' own in the coarse phase, the VAE's input in the others."""
-        at_latent_size = phase == "coarse" or (phase == "appearance" and self.conventions.latents == "area_mean")
+        at_latent_size = phase == "coarse" or (phase == "appearance" and self._sees_shine)
         return self.latent_size * (1 if at_latent_size else self.vae_scale_factor) // self.view_grid
 
     @property
@@ -133,7 +134,11 @@ class DiffusionGuidance(Denoiser):
         Pictures of any size are resized to what the model takes. With `appearance.mask_guidance` noise and gradient are
         multiplied by the part's mask at the latents' size: 1 where the part covers at least `MASK_THRESHOLD` of a cell.
         """
-        images, base = self._images(views.pictures, views.condition, "appearance")
+        pictures, condition = views.pictures, views.condition
+        if self._sees_shine:
+            pictures = torch.cat([pictures, views.shine], dim=1)
+            condition = None if condition is None else torch.cat([condition, views.part_mask], dim=1)
+        images, base = self._images(pictures, condition, "appearance")
         mask = None
         if self.appearance.mask_guidance:
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
@@ -146,10 +151,10 @@ class DiffusionGuidance(Denoiser):
 
         Of geometry pictures (N, 5, H, H), coarse: (n coverage, 2 mask - 1) as it is; refined:
         scaling_factor (E(2 (n + mask) / 2 - 1) - shift_factor). Of colours c (N, 3, H, H): the same with E(2 c - 1), or
-        `colour_latents`.
+        `colour_latents` of colours and shine (N, 4, H, H).
         """
         if phase == "appearance":
-            if self.conventions.latents == "area_mean":
+            if self._sees_shine:
                 return colour_latents(images.float(), self.latent_size)
             side = self.latent_size * self.vae_scale_factor
             pictures = images.float()

@@ -57,6 +57,8 @@ class AppearanceViews:
         condition: the same views with the part in plain grey clay, for a model that sees what it edits, or None.
         mask: (B, 1, H, H) the object's coverage in [0, 1].
         part_mask: (B, 1, H, H) the part's coverage in [0, 1].
+        shine: (B, 1, H, H) `colour_latents.shine` of the part times its coverage, for models that look at it. Gradients
+            flow to it.
         azimuth_deg, elevation_deg, closeup: as in `GuidanceViews`.
     """
 
@@ -64,6 +66,7 @@ class AppearanceViews:
     condition: torch.Tensor | None
     mask: torch.Tensor
     part_mask: torch.Tensor
+    shine: torch.Tensor
     azimuth_deg: Sequence[float]
     elevation_deg: Sequence[float]
     closeup: bool = False
@@ -76,7 +79,7 @@ class AppearanceViews:
             raise ValueError(
                 f"the condition {tuple(self.condition.shape)} must have the shape of the pictures, {shape}"
             )
-        for name in ("mask", "part_mask"):
+        for name in ("mask", "part_mask", "shine"):
             if tuple(getattr(self, name).shape) != (shape[0], 1, *shape[2:]):
                 raise ValueError(f"{name} must be {(shape[0], 1, *shape[2:])}, not {tuple(getattr(self, name).shape)}")
         if not len(self.azimuth_deg) == len(self.elevation_deg) == shape[0]:

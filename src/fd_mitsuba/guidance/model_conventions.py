@@ -28,8 +28,9 @@ class ModelConventions(BaseModel):
     """If given, must agree with the UNet: 8 input channels take the base's picture as condition, 4 do not."""
     condition: Literal["base", "clay"] | None = None
     """What the condition picture shows: the base alone, or the part on it in grey clay. For people, not checked."""
-    latents: Literal["vae", "area_mean"] = "vae"
-    """How colour pictures become latents: by the VAE, or by `colour_latents`, which the VAE then equals."""
+    latents: Literal["vae", "area_mean_shine"] = "vae"
+    """How colour pictures become latents: by the VAE, or by `colour_latents`, where shine is the fourth channel, and in
+    the condition the part's coverage."""
     background: Literal["black", "white"] | None = None
     """Behind the objects of the training pictures, if always the same. For people, not checked."""
     prompt_template: str = "{prompt}, {closeup}, {view}"

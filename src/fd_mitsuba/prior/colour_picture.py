@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fd_mitsuba.guidance.colour_latents import LUMA
+from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.prior.corpus import SUPERSAMPLING, VIEW_SIZE, RayCaster
 from fd_mitsuba.prior.light import Light, reflected
 from fd_mitsuba.prior.looks import CLAY, Material, Pattern
@@ -84,7 +84,10 @@ def paint_hits(
 def mosaics(
     hits: Hits, paint: Paint, light: Light, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Latents (4, 64, 64) int8 with the part in clay and as painted, and the part's coverage (64, 64) uint8."""
+    """Latents (4, 64, 64) int8 with the part in clay and as painted, and the part's coverage (64, 64) uint8.
+
+    The fourth channel is the part's coverage beside the clay, and its shine times that beside the painting.
+    """
     on_part = hits.piece >= 0
     clay = np.full(on_part.sum(), len(paint.roughness) - 1)
     painted = reflected(
@@ -103,10 +106,13 @@ def mosaics(
     shadow = _shadow(hits.point, rng)[:, None]
     plain, painted = plain * shadow, painted * shadow
     exposure = _exposure(plain @ LUMINANCE, on_part, rng)
+    covered = on_part.astype(np.float32)
+    fourth = (covered, covered * shine(paint.roughness, paint.metallic)[paint.material])
     latents = [
-        _latent(hits.pixel, to_srgb(torch.from_numpy(picture * exposure)).numpy()) for picture in (plain, painted)
+        _latent(hits.pixel, to_srgb(torch.from_numpy(picture * exposure)).numpy(), more)
+        for picture, more in zip((plain, painted), fourth, strict=True)
     ]
-    coverage = _tiled(hits.pixel, on_part[:, None].astype(np.float32))[0]
+    coverage = _tiled(hits.pixel, covered[:, None])[0]
     return latents[0], latents[1], np.rint(255 * coverage).astype(np.uint8)
 
 
@@ -124,9 +130,8 @@ def _shadow(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (1 - rng.uniform(0, 0.55) * np.clip(2 * waves, 0, 1)).astype(np.float32)
 
 
-def _latent(pixel: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    picture = _tiled(pixel, colour)
-    both = np.concatenate([picture, np.einsum("c,chw->hw", LUMA, picture)[None]])
+def _latent(pixel: np.ndarray, colour: np.ndarray, fourth: np.ndarray) -> np.ndarray:
+    both = _tiled(pixel, np.concatenate([colour, fourth[:, None]], axis=1))
     return np.clip(np.rint((2 * both - 1) * 127), -127, 127).astype(np.int8)
 
 

@@ -17,15 +17,15 @@ from fd_mitsuba.prior.captions import COLOURS
 from fd_mitsuba.prior.evaluate_colour import balanced_cases, evaluate_colours, prompt
 from fd_mitsuba.prior.looks import NAMED
 from fd_mitsuba.prior.paint_check import Painted, paint
+from fd_mitsuba.scene.bsdf_reading import PlainMaterial
 from fd_mitsuba.training.checkpoint import write_atomically
 from fd_mitsuba.training.record import write_picture
 
 Case = tuple[str, str, str]
 LEAST_NEAREST = 0.85
-PAINT_SETTINGS = AppearanceConfig(timestep_range=(0.02, 0.98), weighting="sds", guidance_scale=1.25)
+PAINT_SETTINGS = AppearanceConfig(timestep_range=(0.02, 0.98), weighting="sds", guidance_scale=1.0)
 """Those of `configs/quick.toml` as far as guidance is concerned."""
-_METALS = ("gold", "silver")
-_NOT_METALS = ("wood", "plastic")
+_MATERIALS = ("gold", "silver", "wood", "plastic")
 _PAINT_SEED = 4
 
 
@@ -50,9 +50,8 @@ def evaluate_paint(
         paint_steps: of the texture field's descent through the guidance.
 
     Returns:
-        What the JSON file holds: shares of nearest anchors in CIELAB for colours, materials and both, how metallic
-        painted metals and others became, and the figure of every prompt. Roughness is not among them: `paint_check`
-        holds it fixed.
+        What the JSON file holds: shares of nearest anchors in CIELAB for colours, materials and both, how metallic and
+        how rough painted materials became, and the figure of every prompt.
     """
     cases = balanced_cases(count, seed)
     figures = evaluate_colours(folder, output, cases, seed, steps)
@@ -99,15 +98,27 @@ def nearest_shares(pairs: Sequence[tuple[str, str]]) -> dict:
 
 
 def painted_figures(done: Sequence[tuple[Case, Painted]]) -> dict:
-    """`nearest_shares` of painted parts, and how metallic those became whose metallic is known."""
-    metallic = {
-        style: round(float(np.mean([p.metallic for case, p in done if case[2] == style])), 3)
-        for style in (*_METALS, *_NOT_METALS)
-        if any(case[2] == style for case, _ in done)
-    }
-    right = {style: (value > 0.5) == (NAMED[style].metallic > 0.5) for style, value in metallic.items()}
+    """`nearest_shares` of painted parts, and how metallic and rough those became of which it is known.
+
+    Right is a metallic on the anchor's side of a half, and a roughness on its side of where every field starts.
+    """
+
+    def means(channel: str) -> dict[str, float]:
+        found = {style: [getattr(p, channel) for case, p in done if case[2] == style] for style in _MATERIALS}
+        return {style: round(float(np.mean(values)), 3) for style, values in found.items() if values}
+
+    def right(means: dict[str, float], channel: str, middle: float) -> dict[str, bool]:
+        return {style: (value > middle) == (getattr(NAMED[style], channel) > middle) for style, value in means.items()}
+
     shares = nearest_shares([(case[2], painted.nearest) for case, painted in done])
-    return {**shares, "metallic": metallic, "metallic_right": right}
+    metallic, roughness = means("metallic"), means("roughness")
+    return {
+        **shares,
+        "metallic": metallic,
+        "metallic_right": right(metallic, "metallic", 0.5),
+        "roughness": roughness,
+        "roughness_right": right(roughness, "roughness", PlainMaterial().roughness),
+    }
 
 
 def _row(case: Case, painted: Painted) -> dict:

@@ -123,7 +123,7 @@ APPEARANCE = Kind(
     masked_noise=0.9,
     prediction="sample",
     build_vae=build_colour_vae,
-    conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean", "background": "black"},
+    conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
 )
 KINDS = {kind.name: kind for kind in (GEOMETRY, APPEARANCE)}
 

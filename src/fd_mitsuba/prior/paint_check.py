@@ -1,7 +1,8 @@
 """Guidance of colours in three dimensions, without a renderer: a texture field on a generated part, lit as in training.
 
 Shows in a minute what the settings of the appearance stage do to a part's colour: the field is the run's own, the
-guidance is the run's own, only the shading is that of `light`, with the roughness held fixed.
+guidance is the run's own, only the shading is that of `light`, with the roughness held fixed; the shine that the model
+sees is the field's.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from fd_mitsuba.config_sections import TextureConfig
 from fd_mitsuba.fields.texture import TextureField
+from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews
 from fd_mitsuba.prior.bodies import BODIES
@@ -22,7 +24,7 @@ from fd_mitsuba.prior.corpus import SUPERSAMPLING, VIEW_SIZE, MosaicCamera, RayC
 from fd_mitsuba.prior.light import DIELECTRIC_F0, lit_by, lobes, random_environment, reflected
 from fd_mitsuba.prior.looks import CLAY, NAMED, Pattern, cielab, random_body_look
 from fd_mitsuba.prior.parts import PARTS
-from fd_mitsuba.render.tonemap import to_srgb
+from fd_mitsuba.render.tonemap import CLAY_LEVEL, to_srgb
 
 _SIZE = VIEW_SIZE * SUPERSAMPLING
 
@@ -30,7 +32,7 @@ _SIZE = VIEW_SIZE * SUPERSAMPLING
 @dataclass(frozen=True)
 class Painted:
     """Mean of the part after painting: sRGB as seen, the anchor it is nearest to in CIELAB under the same light, and
-    the field's base colour (sRGB) and metallic; `speckle` is the standard deviation of the base colour in CIELAB.
+    the field's base colour (sRGB), roughness and metallic; `speckle` is the base colour's standard deviation in CIELAB.
 
     `pictures` are mosaics (3, 128, 128) of one view: clay, then after each quarter of the steps.
     """
@@ -38,6 +40,7 @@ class Painted:
     seen: tuple[float, ...]
     nearest: str
     base_color: tuple[float, ...]
+    roughness: float
     metallic: float
     speckle: float
     pictures: list[np.ndarray] = field(repr=False)
@@ -58,13 +61,20 @@ class Easel:
         self.camera = global_camera(rng)
         self.field = TextureField(texture or TextureConfig(levels=8, finest_resolution=128), seed)
         self._exposure = 1.0
-        view = self.view(self.camera)
-        bright = torch.quantile(view.base[view.pixel_is_base] @ torch.from_numpy(LUMINANCE), 0.95)
-        self._exposure = 0.8 / float(bright)
+        # As the appearance stage: by the light alone, the base in clay.
+        hits = visible(*self._sight(self.camera))
+        body, zone = hits.piece < 0, np.zeros(int((hits.piece < 0).sum()), np.int64)
+        clay = np.full((len(zone), 3), CLAY.grey, np.float32)
+        rough, metal = (np.array([v], np.float32) for v in (CLAY.roughness, CLAY.metallic))
+        light = reflected(self._light, hits.normal[body], hits.to_viewer[body], zone, clay, rough, metal)
+        self._exposure = CLAY_LEVEL / float(np.quantile(light @ LUMINANCE, 0.95))
+
+    def _sight(self, camera: MosaicCamera) -> tuple:
+        rays = camera.rays()[:2]
+        return rays, self._casters[0].cast(*rays), self._casters[1], self._pieces
 
     def view(self, camera: MosaicCamera) -> EaselView:
-        rays = camera.rays()[:2]
-        hits = visible(rays, self._casters[0].cast(*rays), self._casters[1], self._pieces)
+        hits = visible(*self._sight(camera))
         on_part = hits.piece >= 0
         base, zone = np.zeros((4 * _SIZE * _SIZE, 3), np.float32), np.zeros(len(hits.pixel), np.int64)
         colour = self._look.colour(hits.point[~on_part])
@@ -112,6 +122,10 @@ class EaselView:
         flat = torch.zeros(4 * _SIZE * _SIZE).index_fill(0, self.part_pixel, 1.0)
         return flat.reshape(4, 1, _SIZE, _SIZE)
 
+    def shine(self, roughness: Tensor, metallic: Tensor) -> Tensor:
+        flat = torch.zeros(4 * _SIZE * _SIZE).index_copy(0, self.part_pixel, shine(roughness, metallic)[:, 0])
+        return flat.reshape(4, 1, _SIZE, _SIZE)
+
     def mask(self) -> Tensor:
         flat = self.part_mask().flatten().index_fill(0, self.pixel_is_base, 1.0)
         return flat.reshape(4, 1, _SIZE, _SIZE)
@@ -137,6 +151,7 @@ def paint(
             view.clay(),
             view.mask(),
             view.part_mask(),
+            view.shine(values.roughness, values.metallic),
             [camera.azimuth_deg + 90 * k for k in range(4)],
             [camera.elevation_deg] * 4,
             closeup,
@@ -165,6 +180,7 @@ def paint(
             tuple(seen.tolist()),
             min(distance, key=distance.__getitem__),
             tuple(to_srgb(values.base_color.mean(0)).tolist()),
+            float(values.roughness.mean()),
             float(values.metallic.mean()),
             float(np.sqrt(lab.var(0).sum())),
             pictures,

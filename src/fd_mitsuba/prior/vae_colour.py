@@ -1,6 +1,7 @@
 """A colour picture's autoencoder whose weights are written down, not learned: area means of 8 x 8 pixels.
 
-The latents are those of `guidance.colour_latents`; the decoder writes their first three channels back, enlarged.
+The latents are those of `guidance.colour_latents`, without any shine, which a picture does not say; the decoder writes
+their first three channels back, enlarged.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import torch
 from diffusers import AutoencoderTiny
 
-from fd_mitsuba.guidance.colour_latents import LUMA
 from fd_mitsuba.prior.vae import CENTRE, blank_vae, decoder_convolutions
 
 
@@ -22,7 +22,6 @@ def build_colour_vae() -> AutoencoderTiny:
         for k in range(3):
             first.weight[k, k, row, column] = 1  # the encoder itself turns 2 c - 1 back to c
             to_latent.weight[k, k, row, column] = 2
-            to_latent.weight[3, k, row, column] = 2 * LUMA[k]
             from_latent.weight[k, k, row, column], from_latent.bias[k] = 0.5, 0.5
         to_latent.bias.fill_(-1)
     return vae

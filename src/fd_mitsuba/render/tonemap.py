@@ -40,6 +40,10 @@ def luminance(linear: Tensor) -> Tensor:
     return (linear * weights).sum(dim=1, keepdim=True)
 
 
+CLAY_LEVEL = 0.6
+"""Linear luminance that the exposure gives to the brightest part of the base in clay, whose base colour is 0.5."""
+
+
 def auto_exposure(base_path: Tensor, base_mask: Tensor, level: float = 0.8, percentile: float = 95.0) -> float:
     """The factor that gives the brightest part of the base the luminance `level`: one number for a whole run.
 

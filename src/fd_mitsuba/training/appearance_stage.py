@@ -17,12 +17,13 @@ from torch import Tensor
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
+from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.part_shading import PartShading
-from fd_mitsuba.render.tonemap import auto_exposure, to_linear, to_srgb
+from fd_mitsuba.render.tonemap import CLAY_LEVEL, auto_exposure, to_linear, to_srgb
 from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
@@ -37,8 +38,6 @@ from fd_mitsuba.training.surface_points import points_on
 
 _POOL = 32768
 """Points on the parts' surface that the style losses choose from."""
-_CLAY_LEVEL = 0.6
-"""Linear luminance that the exposure gives to the brightest part of the base in clay, whose base colour is 0.5."""
 _INITIAL_STEPS = 300
 """Steps in which the single path's field learns the base's own material before the guidance starts."""
 
@@ -149,6 +148,7 @@ class AppearanceStage:
                 condition=self._condition(gbuffer, pictures, seed, step),
                 mask=gbuffer.alpha,
                 part_mask=gbuffer.part_mask,
+                shine=self._shine(gbuffer, texture),
                 azimuth_deg=cameras.azimuth_deg,
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
@@ -190,6 +190,14 @@ class AppearanceStage:
         """sRGB in [0, 1] over the configured background."""
         return to_srgb((linear + (1 - gbuffer.alpha) * self._background(gbuffer, step)) * self.exposure)
 
+    def _shine(self, gbuffer: GBuffer, texture: TextureValues) -> Tensor:
+        """(B, 1, S, S) of what the field says; constant where the BSDF has only one of roughness and metallic."""
+        values = shine(texture.roughness, texture.metallic)[:, 0]
+        if not {"roughness", "metallic"} <= set(self.material.learned):
+            values = values.detach()
+        film = torch.zeros(gbuffer.part_mask.numel()).index_copy(0, gbuffer.pixel, values.float())
+        return film.view_as(gbuffer.part_mask) * gbuffer.part_mask
+
     def _background(self, gbuffer: GBuffer, step: int) -> Tensor:
         """Radiance behind the object, such that the exposure makes of it what the setting says."""
         kind = self.config.appearance.background
@@ -228,7 +236,7 @@ class AppearanceStage:
         seed = seed_for(self.config.seed, Purpose.EXPOSURE)
         whole = AppearancePass(self.scene, {}, self.shading, 64, 16, deferred_base=True)
         gbuffer = whole.trace(cameras, seed)
-        return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.alpha, _CLAY_LEVEL)
+        return auto_exposure(whole.render_clay(gbuffer, seed), gbuffer.alpha, CLAY_LEVEL)
 
 
 def _detached(pictures: AppearancePictures) -> AppearancePictures:
