@@ -62,7 +62,7 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     )
     evaluate.add_argument("--overviews", action="store_true", help="no views centred on the part: half the time")
     evaluate.add_argument("--steps", type=int, default=16, help="of DDIM; default: 16")
-    evaluate.add_argument("--scale", type=float, default=3.0, help="of the text guidance (shapes); default: 3")
+    evaluate.add_argument("--scale", type=float, default=2.0, help="of the text guidance (shapes); default: 2")
     evaluate.add_argument("--count", type=int, default=24, help="colour or material prompts; default: 24")
     evaluate.add_argument(
         "--paint", type=int, default=0, metavar="N", help="paint so many of them through the guidance"

@@ -72,7 +72,7 @@ def evaluate_parts(
     parts: Sequence[str],
     seed: int = 0,
     steps: int = 16,
-    scale: float = 3.0,
+    scale: float = 2.0,
     closeups: bool = True,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict:
