@@ -72,7 +72,7 @@ ROWS = (
     _scale(10.0, "scale_10"),
     _scale(50.0, "scale_50"),
     Row("colour_t_low", "t of the colour in 0.02..0.5", ("appearance.timestep_range=[0.02, 0.5]",), "appearance"),
-    _colour_scale(1.0, "colour_scale_1"),
+    _colour_scale(3.0, "colour_scale_3"),
     _colour_scale(7.0, "colour_scale_7"),
     _colour_scale(30.0, "colour_scale_30"),
 )
