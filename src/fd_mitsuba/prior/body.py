@@ -9,6 +9,7 @@ import numpy as np
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
 from fd_mitsuba.prior.primitives import Solid, join
 
+_BESIDE = np.array([1.3e-5, 0.7e-5, 0.4e-5])
 _POINTS = ("head_top", "forehead", "back", "side")
 
 
@@ -66,9 +67,13 @@ class Body:
         return np.stack(points), np.tile([0.0, 1.0, 0.0], (count, 1))
 
     def _towards(self, through: np.ndarray, direction: tuple[float, float, float]) -> np.ndarray:
-        """The first surface point of the ray that comes from far away and passes `through`; that point if it misses."""
+        """The first surface point of the ray that comes from far away and passes `through`; that point if it misses.
+
+        The ray is a little beside it, because bodies have edges in the plane x = 0, and rounding lets a ray slip
+        through an edge that it meets exactly.
+        """
         ray = np.asarray(direction, float)
-        origin = through - ray * (ray @ through + 10)
+        origin = through - ray * (ray @ through + 10) + _BESIDE
         a, b, c = (self.solid.vertices[self.solid.faces[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         slope = normal @ ray

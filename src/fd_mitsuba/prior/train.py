@@ -1,4 +1,4 @@
-"""Training of the built-in prior: fresh mosaics every step, v-prediction, resumable at any time."""
+"""Training of the built-in priors: fresh mosaics every step, resumable at any time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import HELD_OUT
-from fd_mitsuba.prior.corpus import Pair
+from fd_mitsuba.prior.corpus import Pair, differs
 from fd_mitsuba.prior.kinds import GEOMETRY, Kind
 from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, encode_text, load_packed
 from fd_mitsuba.prior.parts import PARTS
@@ -25,6 +25,8 @@ OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
 """Bodies that most pictures show; the others keep the copying of the base general."""
 _BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
 _BODY_SHARES /= _BODY_SHARES.sum()
+LEAST_PIXELS = 12
+"""Of a mosaic that must change for a pair to be trained on."""
 PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0) | dict.fromkeys(
     ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
 )
@@ -32,15 +34,29 @@ PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3
 
 
 def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
-    """The pairs of one random body with four of its parts, and now and then of the body alone; none of `HELD_OUT`."""
+    """The pairs of one random body with four of its parts, and in half of the cases of the body alone.
+
+    None is of `HELD_OUT`, and none has a part that the views hardly show: it would teach that the word means nothing.
+    """
     body = str(rng.choice(list(BODIES), p=_BODY_SHARES))
     allowed = [part for part in PARTS if (body, part) not in HELD_OUT]
     shares = np.array([PART_SHARES.get(part, 1.0) for part in allowed])
     drawn = rng.choice(len(allowed), size=4, replace=False, p=shares / shares.sum())
     parts: list[str | None] = [allowed[i] for i in drawn]
-    if rng.random() < 0.15:
+    if rng.random() < 0.5:
         parts.append(None)
-    return kind.make_pairs(body, parts, int(rng.integers(2**31)))
+    pairs = kind.make_pairs(body, parts, int(rng.integers(2**31)))
+    return [pair for pair in pairs if pair.part is None or differs(pair.edited, pair.base).sum() >= LEAST_PIXELS]
+
+
+class Batch(NamedTuple):
+    """Latents (N, 4, 64, 64) in [-1, 1] without, with, and with the rough part, its pixels (N, 1, 64, 64), captions."""
+
+    base: torch.Tensor
+    edited: torch.Tensor
+    rough: torch.Tensor
+    changed: torch.Tensor
+    captions: list[str]
 
 
 class Pairs(Protocol):
@@ -49,8 +65,8 @@ class Pairs(Protocol):
     def refresh(self, count: int) -> None:
         """Bring `count` more pairs in, if that is how it works."""
 
-    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
-        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
+    def batch(self, size: int) -> Batch:
+        """`size` random pairs."""
         ...
 
 
@@ -70,13 +86,15 @@ class Pool:
             self._pairs.extend(made)
             self._owed -= len(made)
 
-    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
-        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
+    def batch(self, size: int) -> Batch:
+        """`size` random pairs."""
         chosen = [self._pairs[i] for i in self._rng.integers(len(self._pairs), size=size)]
-        base = torch.from_numpy(np.stack([p.base for p in chosen])).float() / 127
-        edited = torch.from_numpy(np.stack([p.edited for p in chosen])).float() / 127
-        changed = torch.from_numpy(np.stack([p.changed() for p in chosen])).float()[:, None]
-        return base, edited, changed, [p.caption for p in chosen]
+        base, edited, rough = (
+            torch.from_numpy(np.stack(pictures)).float() / 127
+            for pictures in zip(*((pair.base, pair.edited, pair.rough_start()) for pair in chosen), strict=True)
+        )
+        changed = torch.from_numpy(np.stack([pair.changed() for pair in chosen])).float()[:, None]
+        return Batch(base, edited, rough, changed, [pair.caption for pair in chosen])
 
 
 def train(
@@ -89,6 +107,7 @@ def train(
     seed: int = 0,
     init: Path | None = None,
     pairs: Pairs | None = None,
+    half: bool = False,
 ) -> None:
     """Train until `total_steps` or for `seconds`, whichever is first; continue from `folder` if it holds a checkpoint.
 
@@ -97,6 +116,7 @@ def train(
         kind: which prior.
         init: optional folder of packed weights to start from instead of random ones; no step is small then.
         pairs: what to train on instead of freshly rendered pictures.
+        half: multiply in bfloat16: 1.5 times as fast on a processor that has it, slower on others.
     """
     files = TrainingFolder(folder)
     torch.manual_seed(seed)
@@ -140,9 +160,9 @@ def train(
         rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
         for group in optimiser.param_groups:
             group["lr"] = rate
-        base, edited, changed, captions = pool.batch(batch_size)
+        base, edited, rough, changed, captions = pool.batch(batch_size)
         if step < small_steps:
-            base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
+            base, edited, rough = (avg_pool2d(pictures, 2) for pictures in (base, edited, rough))
             changed = (avg_pool2d(changed, 2) > 0.4).float()
         draw = torch.rand(batch_size, generator=generator).tolist()
         captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
@@ -152,11 +172,18 @@ def train(
         if kind.masked_noise:
             masked = torch.rand(batch_size, generator=generator) < kind.masked_noise
             noise = torch.where(masked[:, None, None, None], noise * changed, noise)
+        seen = edited
+        if kind.rough_share:
+            is_rough = torch.rand(batch_size, generator=generator) < kind.rough_share
+            seen = torch.where(is_rough[:, None, None, None], rough, edited)
         a = alphas[times][:, None, None, None]
-        noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
+        noisy = a.sqrt() * seen + (1 - a).sqrt() * noise
         target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
-        condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
-        predicted = unet(condition, times, encode_text(tokenizer, encoder, captions)).sample
+        condition = base * keep_base
+        inputs = torch.cat([noisy, condition], 1).contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            predicted = unet(inputs, times, encode_text(tokenizer, encoder, captions)).sample
+        predicted = predicted.float() + condition if kind.difference else predicted.float()
         error = squared_error(predicted - target, kind.tint_weight)
         loss = (error * (1 + kind.part_weight * changed)).mean()
         if kind.copy_weight:
