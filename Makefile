@@ -38,6 +38,7 @@ bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json
 	$(PY) benchmarks/appearance_step.py --json
 	$(PY) benchmarks/export_part.py --json
+	$(PY) benchmarks/guidance_call.py --json
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
