@@ -83,7 +83,7 @@ class CheckReport:
         for region in self.regions:
             touch = "touches the base" if region.gap_to_base == 0 else f"{region.gap_to_base:.3g} from the base"
             lines.append(
-                f"region   {region.name} (part {region.part}): {touch}, {region.share_in_grid:.0%} in the grid, "
+                f"region   {region.name} (part {region.part}): {touch}, {region.share_in_grid:.1%} in the grid, "
                 f"{region.share_in_base:.0%} within the base, {region.thickness_cells:.1f} cells thin"
             )
         cost = self.cost
@@ -176,9 +176,9 @@ def _region_warnings(regions: tuple[RegionCheck, ...], config: RunConfig) -> lis
     warnings = []
     for region in regions:
         name = f"region {region.name}"
-        if region.share_in_grid < 0.995:
+        if region.share_in_grid < 0.999:  # a cap of half a percent is a tenth of an ellipsoid's depth, cut flat
             warnings.append(
-                f"{name}: {1 - region.share_in_grid:.0%} of it lies outside the grid and cannot be edited; "
+                f"{name}: {1 - region.share_in_grid:.1%} of it lies outside the grid and cannot be edited; "
                 "move or shrink it until it fits the grid's extent above"
             )
         if region.gap_to_base > 0:

@@ -16,12 +16,15 @@ Rng = np.random.Generator
 def rough_part(part: Solid, rng: Rng) -> Solid:
     """Lumps where the part is; the swollen part; or the part that comes out of smaller lumps.
 
+    Most lumps are as large as a region must be for the part to lie in it: the corners of a box reach the surface of an
+    ellipsoid 1.7 times as long as the box in every direction.
+
     Args:
         part: closed, outward.
     """
     kind = rng.random()
     if kind < 0.55:
-        return lumps(part, rng, *((0.75, 1.2) if rng.random() < 0.75 else (0.35, 0.75)))
+        return lumps(part, rng, *((0.95, 1.7) if rng.random() < 0.75 else (0.35, 0.95)))
     swollen = _swollen(part, rng)
     return swollen if kind < 0.75 else join([swollen, lumps(part, rng, 0.4, 0.9)])
 
