@@ -1,4 +1,7 @@
-"""The GLB of every shipped scene, its focal regions as parts with a textured material: Khronos' validator is silent."""
+"""The GLB of every shipped scene, its focal regions as parts with a textured material: Khronos' validator is silent.
+
+Every day with parts of a coarse grid; `-m slow` with those of a grid as fine as a run's.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,21 @@ from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.training.geometry_stage import GeometryStage
 
-ROOT = Path(__file__).resolve().parents[2]
-QUICK = ("mug", "stump_butterfly")
-"""The smallest two, for every day; the others are slow."""
-SCENES = [
-    pytest.param(path, marks=[] if path.parent.name in QUICK else pytest.mark.slow, id=path.parent.name)
-    for path in sorted((ROOT / "scenes").glob("*/scene.xml"))
-]
+SCENES = sorted((Path(__file__).resolve().parents[2] / "scenes").glob("*/scene.xml"))
 
 
 @needs_validator
-@pytest.mark.parametrize("path", SCENES)
-def test_shipped_scene(path: Path, tmp_path: Path) -> None:
-    scene = load_edit_scene(path)
-    settings = {"field": {"offsets": False}, "geometry": {"grid_resolution": 40}}
-    config = RunConfig.model_validate(settings)
-    stage, field = GeometryStage(scene, config, None), TextureField(seed=0)
-    parts = {}
-    for name in scene.parts:
-        solid = part_solid(stage, name)
-        parts[name] = PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field)
-    export_assets(scene, config, parts, tmp_path, ["glb"], texture_size=64)
-    assert glb_faults(tmp_path / "asset.glb") == {}
+@pytest.mark.parametrize("resolution", [24, pytest.param(64, marks=pytest.mark.slow)])
+def test_shipped_scenes(resolution: int, tmp_path: Path) -> None:
+    config = RunConfig.model_validate({"field": {"offsets": False}, "geometry": {"grid_resolution": resolution}})
+    field = TextureField(seed=0)
+    for path in SCENES:
+        scene = load_edit_scene(path)
+        stage = GeometryStage(scene, config, None)
+        solids = {name: part_solid(stage, name) for name in scene.parts}
+        parts = {name: PartAsset(scene.frame.to_user(s.vertices), s.faces, field) for name, s in solids.items()}
+        assert all(len(solid.faces) > 100 for solid in solids.values()), path
+        export_assets(scene, config, parts, tmp_path / path.parent.name, ["glb"], texture_size=64)
+    files = sorted(tmp_path.glob("*/asset.glb"))
+    assert len(files) == 15
+    assert glb_faults(*files) == {}

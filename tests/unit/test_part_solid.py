@@ -171,6 +171,22 @@ def test_a_wider_gap_is_bridged(gap: float) -> None:
     assert np.abs(np.linalg.norm(solid.vertices[far] - centre, axis=1) - 0.2).max() < 0.008  # left alone
 
 
+def test_a_gap_is_bridged_also_where_the_field_falls_steeply() -> None:
+    """Losses may leave any values outside of the part: six times the distance, here."""
+    stage = stage_of({"part": [((0.0, BASE_RADIUS + 0.045 + 0.2, 0.0), 0.2)]})
+    values = stage.extractor.lattice_values
+
+    def steep(field: PartField) -> tuple[torch.Tensor, torch.Tensor]:
+        sdf, positions = values(field)
+        return torch.where(sdf < 0, 6 * sdf, sdf), positions
+
+    stage.extractor.lattice_values = steep
+    solid = part_solid(stage, None)
+    check(solid)
+    assert 0 < solid.bridged <= BRIDGE_REACH and solid.gap(base_mesh()) == 0.0
+    assert len(trimesh.Trimesh(solid.vertices, solid.faces, process=False).split(only_watertight=False)) == 1
+
+
 def test_what_floats_far_away_stays_and_its_gap_is_measured() -> None:
     solid = part_solid(stage_of({"part": [((0.0, 0.85, 0.0), 0.15)]}), None)
     check(solid)

@@ -113,3 +113,19 @@ def test_tangents_of_a_known_map(mirrored: bool) -> None:
     assert np.all(tangents[:, 3] == (-1 if mirrored else 1))
     up = tangents[:, 3:] * np.cross(normals, tangents[:, :3])
     assert np.allclose(up, [0, 1, 0], atol=1e-9)
+
+
+def test_faces_without_area_lie_at_the_edge_of_a_neighbour() -> None:
+    """One edge of a ball gets a vertex in its middle that only one of its sides knows, and a face without area."""
+    vertices, faces = unit_sphere(2)
+    (a, b, c), middle = faces[0], len(vertices)
+    vertices = np.concatenate([vertices, (vertices[[a]] + vertices[[b]]) / 2])
+    faces = np.concatenate([faces[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
+    mesh = unwrap(vertices, faces, SIZE)
+    assert np.array_equal(mesh.vertex_map[mesh.faces], faces)
+    corners = mesh.uv[mesh.faces] * SIZE
+    thin, rest = corners[-1], corners[:-1].reshape(-1, 2)
+    assert np.abs(thin - thin.mean(axis=0)).max() < 1.1 * np.abs(corners[0] - corners[0].mean(axis=0)).max()
+    known = mesh.vertex_map[mesh.faces[:-1]].ravel()
+    for vertex, place in zip(faces[-1], thin, strict=True):
+        assert np.linalg.norm(rest[known == vertex] - place, axis=1).min() < 1e-6

@@ -55,10 +55,10 @@ def bridge_gaps(
     """`sdf_part` (count,) swollen towards the base where a piece ends just before it, and by how much at most.
 
     A piece is joined to the base if it has a vertex inside it. One that is not, though it is large, swells near its
-    end: with gap g to the base and swelling a, sdf_part grows by a clamp((g + 2 a + sdf_base) / 2 a, 0, 1), all of a up
-    to a distance g from the base and nothing beyond g + 2 a. That grows half as fast as sdf_part falls, so the part's
-    surface stays one. The smallest a that joins is taken, in steps of half a cell, and half a cell more, so that the
-    joint is no mere thread. A piece that would need more than `BRIDGE_REACH` stays as it was.
+    end: with gap g to the base and swelling a, its signed distance grows by a clamp((g + 2 a + sdf_base) / 2 a, 0, 1),
+    all of a up to a distance g from the base and nothing beyond g + 2 a. That grows half as fast as the distance falls,
+    so the part's surface stays one. The smallest a that joins is taken, in steps of half a cell, and half a cell more,
+    so that the joint is no mere thread. A piece that would need more than `BRIDGE_REACH` stays as it was.
 
     Args:
         inside_of: the solid (count,) bool that belongs to a `sdf_part`.
@@ -72,15 +72,19 @@ def bridge_gaps(
     nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     nearest_piece = torch.from_numpy(label[tuple(nearest)]).view(-1)
     bridged, most, half_cell = sdf_part, 0.0, grid.spacing / 2
+    # Outside the part its sdf is what the losses left there, often far below the true one: no swelling gets over it.
+    true = torch.maximum(sdf_part, -distance_to(grid, sdf_part > 0))
     for piece in floating:
         own, core = nearest_piece == piece, torch.from_numpy(label == piece).view(-1)
         seed = int(torch.where(core, sdf_part, -torch.inf).argmax())
         gap = float(-sdf_base[core].max())
         for step in range(1, int((BRIDGE_REACH - half_cell) / half_cell) + 1):
-            if not _reaches(grid, inside_of(_swollen(sdf_part, sdf_base, own, gap, step * half_cell)), seed, sdf_base):
+            if not _reaches(
+                grid, inside_of(_swollen(sdf_part, true, sdf_base, own, gap, step * half_cell)), seed, sdf_base
+            ):
                 continue
             swelling = (step + 1) * half_cell
-            bridged = torch.maximum(bridged, _swollen(sdf_part, sdf_base, own, gap, swelling))
+            bridged = torch.maximum(bridged, _swollen(sdf_part, true, sdf_base, own, gap, swelling))
             most = max(most, swelling)
             break
     return bridged, most
@@ -94,9 +98,9 @@ def distance_to(grid: TetGrid, marked: Tensor) -> Tensor:
     return torch.from_numpy(distance).view(-1).float()
 
 
-def _swollen(sdf_part: Tensor, sdf_base: Tensor, where: Tensor, gap: float, swelling: float) -> Tensor:
-    weight = ((gap + 2 * swelling + sdf_base) / (2 * swelling)).clamp(0, 1)
-    return sdf_part + swelling * weight * where
+def _swollen(sdf_part: Tensor, true: Tensor, sdf_base: Tensor, where: Tensor, gap: float, swelling: float) -> Tensor:
+    weight = ((gap + 2 * swelling + sdf_base) / (2 * swelling)).clamp(0, 1) * where
+    return torch.where(weight > 0, torch.maximum(sdf_part, true + swelling * weight), sdf_part)
 
 
 def _reaches(grid: TetGrid, inside: Tensor, seed: int, sdf_base: Tensor) -> bool:
