@@ -23,6 +23,7 @@ from appearance_setup import (
     write_sky,
 )  # fmt: skip
 
+from fd_mitsuba.config_sections import TextureConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.views import ring_views
@@ -99,8 +100,8 @@ def test_the_light_behind_the_object_is_what_stock_mitsuba_shows(sky: EditScene,
 def test_a_white_part_in_a_white_furnace_gains_no_energy(tmp_path: Path) -> None:
     """Alone in light of radiance 1 from everywhere, no BSDF should send back more than 1.
 
-    A white dielectric `principled` does by itself, as its specular lobe comes on top of the diffuse one: here nothing
-    may be added to what stock Mitsuba says, and a base colour of 0.9 must be enough to stay below 1.
+    A white dielectric `principled` does by itself, as its specular lobe comes on top of the diffuse one: nothing may be
+    added to what stock Mitsuba says, and the lightest base colour that the field can have must stay below 1.
     """
     scene = blocks(tmp_path, WHITE)
     far, size, view = ball(height=60.0), 16, camera(height=60.0, fov=14.0)
@@ -112,14 +113,18 @@ def test_a_white_part_in_a_white_furnace_gains_no_energy(tmp_path: Path) -> None
         return float(pictures.merged[(pictures.part_mask == 1).expand_as(pictures.merged)].mean())
 
     passes: dict[str, AppearancePass] = {}
+    ranges = TextureConfig()
+    lightest, smoothest = ranges.base_color_range[1], ranges.roughness_range[0]
     assert 0.99 < mean("diffuse", 1.0, 0.0, 0.0) < 1.005
-    for rough in (0.2, 0.6, 1.0):
+    for rough in (smoothest, 0.3, 0.6, 1.0):
         assert 0.6 < mean("roughconductor", 1.0, rough, 0.0) < 1.005
         assert 0.3 < mean("principled", 1.0, rough, 1.0) < 1.005
-        assert 0.6 < mean("principled", 0.9, rough, 0.0) < 1.005
-    white = {"type": "principled", "base_color": {"type": "rgb", "value": 1.0}, "roughness": 0.2, "metallic": 0.0}
-    expected, alpha = stock(scene, far, white, view, size, 256)
-    assert mean("principled", 1.0, 0.2, 0.0) == pytest.approx(expected[alpha == 1].mean(), rel=5e-3)
+        assert 0.6 < mean("principled", lightest, rough, 0.0) < 1.0
+        assert 0.6 < mean("principled", lightest, rough, 0.5) < 1.0
+    for colour, rough, metal in ((1.0, 0.2, 0.0), (1.0, 1.0, 0.0), (lightest, smoothest, 0.0), (0.97, 0.4, 0.3)):
+        white = {"type": "principled", "base_color": {"type": "rgb", "value": colour}}
+        expected, alpha = stock(scene, far, white | {"roughness": rough, "metallic": metal}, view, size, 1024)
+        assert mean("principled", colour, rough, metal) == pytest.approx(expected[alpha == 1].mean(), rel=5e-3)
 
 
 def test_bent_normals_gain_no_energy_and_leave_no_black_pixel(tmp_path: Path) -> None:
