@@ -37,6 +37,8 @@ from fd_mitsuba.training.step_views import check_views
 
 _SHEET_VIEWS = 8
 _VIDEO_SPP, _SHEET_SPP = 12, 32
+_BRIGHTEST_BOUNCE = 4.0
+"""What a sample may see by way of another surface in the pictures of `render_run`, in units of the picture's white."""
 CUTS_UNKNOWN = (
     "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "
     "appearance.style=true for faces that go on with the base's material, or guidance.model to a Stable Diffusion model"
@@ -205,6 +207,7 @@ def render_run(
     if stage is None:
         raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")
     stage.set_bounces()
+    stage.rendering.limit_bounces(_BRIGHTEST_BOUNCE / stage.exposure)
     frames = lit_turntable(stage, views, size, spp)
     paths = [folder / "renders" / f"{name}.png"]
     write_sheet({scene.prompt: frames}, paths[0])

@@ -84,6 +84,19 @@ def test_bounces_are_those_of_stock_mitsuba(lamp: EditScene, depth: int) -> None
     assert_as_stock(lamp, "diffuse", depth)
 
 
+def test_limited_bounces_lie_between_direct_light_and_all_of_it(lamp: EditScene) -> None:
+    direct, bounced = (AppearancePass(lamp, {"part": ball()}, shading("diffuse"), 16, 32, depth) for depth in (2, 3))
+    least, most = (render(rendering, camera(), "diffuse").merged for rendering in (direct, bounced))
+    found = {}
+    for limit in (0.0, 0.2, 1e9):
+        bounced.limit_bounces(limit)
+        found[limit] = render(bounced, camera(), "diffuse").merged
+    assert torch.allclose(found[0.0], least, atol=1e-6) and torch.equal(found[1e9], most)
+    between = found[0.2]
+    assert (between <= most + 1e-6).all() and (between >= least - 1e-6).all()
+    assert float(least.sum()) < 0.99 * float(between.sum()) < 0.99 * float(most.sum())
+
+
 def test_the_light_behind_the_object_is_what_stock_mitsuba_shows(sky: EditScene, lamp: EditScene) -> None:
     high = camera(elevation=-20.0, fov=60.0)
     appearance = AppearancePass(sky, {"part": ball()}, shading("diffuse"), 24, 256)
