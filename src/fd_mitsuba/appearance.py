@@ -24,6 +24,7 @@ from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import shape_triangles
+from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -32,9 +33,12 @@ from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, 
 from fd_mitsuba.training.record import write_picture
 from fd_mitsuba.training.saved_run import saved_run
 from fd_mitsuba.training.sheets import map_rows
+from fd_mitsuba.training.step_views import check_views
 
 _SHEET_VIEWS = 8
 _VIDEO_SPP, _SHEET_SPP = 12, 32
+_BRIGHTEST_BOUNCE = 4.0
+"""What a sample may see by way of another surface in the pictures of `render_run`, in units of the picture's white."""
 CUTS_UNKNOWN = (
     "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "
     "appearance.style=true for faces that go on with the base's material, or guidance.model to a Stable Diffusion model"
@@ -102,10 +106,13 @@ def prepare_appearance(
         shared: the geometry stage's guidance, so that a large model is loaded once.
 
     Raises:
-        UserError: see `check_appearance_inputs`, `DiffusionGuidance.load` and `take_prompt`.
+        UserError: see `check_appearance_inputs`, `part_material`, `DiffusionGuidance.load`, `check_views` and
+            `take_prompt`.
     """
     for warning in check_appearance_inputs(scene):
         say(warning)
+    # The stage asks again, but only after the shape is there: nobody shall wait for that to hear of a wrong material.
+    part_material(scene, config.appearance.fixed, config.appearance.normal_map)
     if config.appearance.lambda_sds == 0:
         return None
     if shared is None:
@@ -114,6 +121,7 @@ def prepare_appearance(
         guidance = shared.for_appearance(config.appearance)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
+    check_views(AppearanceStage.name, config, guidance)
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt)
     return guidance
 
@@ -199,6 +207,7 @@ def render_run(
     if stage is None:
         raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")
     stage.set_bounces()
+    stage.rendering.limit_bounces(_BRIGHTEST_BOUNCE / stage.exposure)
     frames = lit_turntable(stage, views, size, spp)
     paths = [folder / "renders" / f"{name}.png"]
     write_sheet({scene.prompt: frames}, paths[0])

@@ -11,9 +11,12 @@ import numpy as np
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.cost import CostEstimate, estimate_cost
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene, gap_to_base, share_in_grid
 from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.triangle_mesh import Topology, topology
 
 THINNEST_IN_CELLS = 3.0
@@ -205,7 +208,13 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
         warnings.append("no base_prompt: preservation scores and before/after prompts lack it; describe the base")
     elif scene.base_prompt.casefold() == scene.prompt.casefold():
         warnings.append("prompt and base_prompt are the same; say in the prompt what shall be added")
-    if not scene.has_light:
+    if scene.has_light:
+        try:
+            warnings += check_appearance_inputs(scene)
+            part_material(scene, config.appearance.fixed, config.appearance.normal_map)
+        except UserError as error:
+            warnings.append(f"no material can be learned, only a shape (--stage geometry): {error}")
+    else:
         warnings.append("no emitter: previews use a lamp of their own; add an envmap for the appearance")
     if config.geometry.lambda_focal == 0:
         warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")

@@ -74,7 +74,8 @@ class TextureConfig(Section):
     finest_resolution: Count = 1024
     log2_table: Annotated[int, Field(ge=4, le=24)] = 16
     hidden: Count = 32
-    base_color_range: Range = (0.03, 0.97)
+    base_color_range: Range = (0.03, 0.94)
+    """Above 0.94 a `principled` returns more light than it gets, since its highlight comes on top of the rest."""
     roughness_range: Range = (0.08, 1.0)
     metallic_range: Range = (0.0, 1.0)
     max_tilt_deg: Annotated[float, Field(ge=0, lt=90)] = 30.0
@@ -125,6 +126,8 @@ class AppearanceConfig(Section):
     """Standard deviation of the paper's delta, canonical units."""
     boundary_reach: Positive = 0.03
     """The part's boundary is its surface within this distance of the base, canonical units."""
+    lambda_bend: NonNegative = 0.0
+    """Price on bends of the shading normal, so that they are detail and not a lean of the whole part to the light."""
     single_path: bool = False
     """The paper's ablation: one field for the whole object, the base included."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr  # noqa: E402  (after `appearance_setup`, which chooses the LLVM)
+import numpy as np
 import pytest
 import torch
 from appearance_setup import (
@@ -22,9 +24,12 @@ from appearance_setup import (
     write_sky,
 )
 
+from fd_mitsuba.config_sections import TextureConfig
+from fd_mitsuba.fields.texture import TextureField
+
 SIZE = 8
 STEP = {"base_color": 0.02, "roughness": 0.005, "metallic": 0.02, "normal": 0.005}
-WIDE = 0.03
+WIDE, NARROW = 0.03, 0.01
 Fields = dict[str, torch.Tensor]
 
 
@@ -121,6 +126,49 @@ def test_the_whole_picture_matches_finite_differences(scene: EditScene, name: st
     assert float(found) == pytest.approx(float(expected), rel=0.03)
 
 
+@pytest.mark.parametrize("name", ["mlp", "grid"])
+def test_directional_derivative_in_the_fields_weights(scene: EditScene, name: str) -> None:
+    """In one group of weights, halfway between uphill and a random direction, with directions of light that follow the
+    material. The step is small, since a larger one passes kinks of the perceptron's hidden layer."""
+    field = TextureField(TextureConfig(levels=4, finest_resolution=16, log2_table=12), seed=3)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+    appearance = AppearancePass(scene, {"part": ball()}, shading("principled"), SIZE, 8192)
+    gbuffer = appearance.trace(camera(), seed=1)
+
+    def loss(seed: int) -> torch.Tensor:
+        values = field(gbuffer.points)
+        fed = {channel: getattr(values, channel) for channel in (*CONSTANT, "normal")}
+        return pixel_losses(appearance, gbuffer, fed, seed).sum()
+
+    group = {key: value for key, value in field.named_parameters() if key.startswith(name)}
+    loss(9).backward()
+    slopes = {key: value.grad.clone() for key, value in group.items()}
+    noise = {key: torch.randn(value.shape, generator=generator) for key, value in group.items()}
+    uphill, sideways = (torch.cat([value.flatten() for value in part.values()]).norm() for part in (slopes, noise))
+    direction = {key: slopes[key] / uphill + noise[key] / sideways for key in group}
+
+    @torch.no_grad()
+    def moved(step: float, seed: int) -> float:
+        for key, value in group.items():
+            value += step * direction[key]
+        result = float(loss(seed))
+        for key, value in group.items():
+            value -= step * direction[key]
+        return result
+
+    found, expected = 0.0, 0.0
+    for seed in (9, 20, 31, 42):
+        field.zero_grad()
+        loss(seed).backward()
+        found += sum(float((value.grad * direction[key]).sum()) for key, value in group.items())
+        expected += (moved(NARROW, seed) - moved(-NARROW, seed)) / (2 * NARROW)
+    assert abs(expected) > 1
+    assert found == pytest.approx(expected, rel=0.03)
+
+
 @pytest.mark.parametrize("plugin", ["diffuse", "roughconductor"])
 def test_other_bsdfs_match_finite_differences(scene: EditScene, plugin: str) -> None:
     appearance = AppearancePass(scene, {"part": ball()}, shading(plugin), size=16, spp=64)
@@ -140,22 +188,41 @@ def test_other_bsdfs_match_finite_differences(scene: EditScene, plugin: str) -> 
             assert float((found - expected).norm() / expected.norm()) < 0.03, name
 
 
-def test_nothing_reaches_the_base(scene: EditScene) -> None:
-    """No parameter of base or light takes part in Dr.Jit's derivative, and its picture is a constant of torch."""
-    appearance = AppearancePass(scene, {"part": ball()}, shading("principled"), SIZE, 16)
-    gbuffer = appearance.trace(camera(), seed=1)
+def test_nothing_reaches_the_base(tmp_path: Path) -> None:
+    """Every number of base and light asks for its derivative and gets exactly zero; stock Mitsuba gives others."""
+    bsdf = '<bsdf type="principled"><rgb name="base_color" value="0.7, 0.4, 0.2"/></bsdf>'
+    edited = blocks(tmp_path, write_sky(tmp_path) + AREA, bsdf)
+    appearance = AppearancePass(edited, {"part": ball()}, shading("principled"), SIZE, 16)
     parameters = mi.traverse(appearance.scene.lit)
+    part = f"object_{len(appearance.scene.base_shapes)}."
+    watched = [key for key, value in parameters.items() if dr.is_array_v(value) and dr.is_float_v(value)]
+    watched = [key for key in watched if not key.startswith(part) and dr.width(parameters[key])]
+    names = {name for key in watched for name in key.split(".")}
+    assert {"base_color", "roughness", "vertex_positions", "radiance", "data"} <= names
+    for key in watched:
+        dr.enable_grad(parameters[key])
+        parameters.set_dirty(key)
+    parameters.update()
+    gbuffer = appearance.trace(camera(fov=40.0), seed=1)
     values = {name: value.requires_grad_() for name, value in fields(gbuffer).items()}
     pictures = appearance.render(gbuffer, **values, seed=2)
-    pictures.merged.sum().backward()
-    assert not pictures.base_path.requires_grad and not pictures.alpha.requires_grad
+    assert pictures.base_path.any() and not pictures.base_path.requires_grad and not pictures.alpha.requires_grad
+    pictures.merged.square().sum().backward()
     assert all(float(value.grad.abs().sum()) > 0 for value in values.values())
-    checked = 0
-    for _, value in parameters.items():
-        if dr.is_array_v(value) and dr.is_float_v(value):
-            assert not dr.grad_enabled(value)
-            checked += 1
-    assert checked
+    reached = [key for key in watched if not zero_gradient(parameters[key])]
+    assert all(dr.grad_enabled(parameters[key]) for key in watched) and not reached
+    eye = mi.ScalarTransform4f().look_at([4, 4, 4], [0, 1, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    sensor = mi.load_dict({"type": "perspective", "to_world": eye, "film": film})
+    integrator = mi.load_dict({"type": "direct"})
+    picture = mi.render(appearance.scene.lit, parameters, sensor=sensor, integrator=integrator, spp=16)
+    dr.backward(dr.mean(picture, axis=None))
+    reached = {key.partition(".")[2] for key in watched if not zero_gradient(parameters[key])}
+    assert {"bsdf.base_color.value", "emitter.radiance.value", "scale"} <= reached
+
+
+def zero_gradient(value: Any) -> bool:
+    return not any(np.array(dr.grad(value)).ravel())
 
 
 def test_a_bent_normal_that_faces_away_still_gives_light_and_gradients(scene: EditScene) -> None:

@@ -101,6 +101,20 @@ def test_a_part_that_is_asked_to_shine_becomes_smooth_metal(
         assert after["mean_metallic"] > before["mean_metallic"] + 0.1
 
 
+def test_normals_do_not_lean_to_the_light_where_bends_have_a_price(scene: EditScene, lump: SimpleNamespace) -> None:
+    """A part that is asked to be brighter than its material can be leans to the lamp; the price on bends stops that."""
+    tilts = {}
+    for price in (0.0, 100.0):
+        values = settings(lambda_bend=price, steps=25)
+        stage = AppearanceStage(scene, values, {"part": lump}, AskForColour(torch.ones(3, 1, 1)), lambda line: None)
+        for step in range(stage.steps):
+            stage.step(step)
+        with torch.no_grad():
+            normal = stage.field(stage._points[:1024]).normal
+        tilts[price] = float(torch.rad2deg(torch.arccos(normal[:, 2].clamp(max=1))).mean())
+    assert tilts[0.0] > 10 and tilts[100.0] < 0.3 * tilts[0.0]
+
+
 def test_style_consistency_ties_the_part_to_the_base(scene: EditScene, lump: SimpleNamespace) -> None:
     """With it, the colour step across the boundary is at most half of that without; the base here is a grey 0.5."""
     steps = {}

@@ -157,6 +157,15 @@ def test_output_that_cannot_be_written(
     assert (tmp_path / "file").read_text() == "precious"
 
 
+def test_a_material_that_cannot_be_learned_is_said_before_the_shape_is_made(
+    make_scene: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    glass = make_scene(part='<bsdf type="dielectric" id="part"/>')
+    words = [word for item in (*TINY, "appearance.lambda_sds=0") for word in ("--set", item)]
+    code, line = call(capfd, "run", glass, "-q", "-o", tmp_path / "out", *words)
+    assert code == 1 and "nothing to learn" in line and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("resume", [(), ("--resume",)])
 def test_output_folder_of_something_else(
     scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], resume: tuple[str, ...]

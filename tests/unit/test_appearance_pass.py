@@ -23,6 +23,7 @@ from appearance_setup import (
     write_sky,
 )  # fmt: skip
 
+from fd_mitsuba.config_sections import TextureConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.views import ring_views
@@ -83,6 +84,19 @@ def test_bounces_are_those_of_stock_mitsuba(lamp: EditScene, depth: int) -> None
     assert_as_stock(lamp, "diffuse", depth)
 
 
+def test_limited_bounces_lie_between_direct_light_and_all_of_it(lamp: EditScene) -> None:
+    direct, bounced = (AppearancePass(lamp, {"part": ball()}, shading("diffuse"), 16, 32, depth) for depth in (2, 3))
+    least, most = (render(rendering, camera(), "diffuse").merged for rendering in (direct, bounced))
+    found = {}
+    for limit in (0.0, 0.2, 1e9):
+        bounced.limit_bounces(limit)
+        found[limit] = render(bounced, camera(), "diffuse").merged
+    assert torch.allclose(found[0.0], least, atol=1e-6) and torch.equal(found[1e9], most)
+    between = found[0.2]
+    assert (between <= most + 1e-6).all() and (between >= least - 1e-6).all()
+    assert float(least.sum()) < 0.99 * float(between.sum()) < 0.99 * float(most.sum())
+
+
 def test_the_light_behind_the_object_is_what_stock_mitsuba_shows(sky: EditScene, lamp: EditScene) -> None:
     high = camera(elevation=-20.0, fov=60.0)
     appearance = AppearancePass(sky, {"part": ball()}, shading("diffuse"), 24, 256)
@@ -99,8 +113,8 @@ def test_the_light_behind_the_object_is_what_stock_mitsuba_shows(sky: EditScene,
 def test_a_white_part_in_a_white_furnace_gains_no_energy(tmp_path: Path) -> None:
     """Alone in light of radiance 1 from everywhere, no BSDF should send back more than 1.
 
-    A white dielectric `principled` does by itself, as its specular lobe comes on top of the diffuse one: here nothing
-    may be added to what stock Mitsuba says, and a base colour of 0.9 must be enough to stay below 1.
+    A white dielectric `principled` does by itself, as its specular lobe comes on top of the diffuse one: nothing may be
+    added to what stock Mitsuba says, and the lightest base colour that the field can have must stay below 1.
     """
     scene = blocks(tmp_path, WHITE)
     far, size, view = ball(height=60.0), 16, camera(height=60.0, fov=14.0)
@@ -112,14 +126,18 @@ def test_a_white_part_in_a_white_furnace_gains_no_energy(tmp_path: Path) -> None
         return float(pictures.merged[(pictures.part_mask == 1).expand_as(pictures.merged)].mean())
 
     passes: dict[str, AppearancePass] = {}
+    ranges = TextureConfig()
+    lightest, smoothest = ranges.base_color_range[1], ranges.roughness_range[0]
     assert 0.99 < mean("diffuse", 1.0, 0.0, 0.0) < 1.005
-    for rough in (0.2, 0.6, 1.0):
+    for rough in (smoothest, 0.3, 0.6, 1.0):
         assert 0.6 < mean("roughconductor", 1.0, rough, 0.0) < 1.005
         assert 0.3 < mean("principled", 1.0, rough, 1.0) < 1.005
-        assert 0.6 < mean("principled", 0.9, rough, 0.0) < 1.005
-    white = {"type": "principled", "base_color": {"type": "rgb", "value": 1.0}, "roughness": 0.2, "metallic": 0.0}
-    expected, alpha = stock(scene, far, white, view, size, 256)
-    assert mean("principled", 1.0, 0.2, 0.0) == pytest.approx(expected[alpha == 1].mean(), rel=5e-3)
+        assert 0.6 < mean("principled", lightest, rough, 0.0) < 1.0
+        assert 0.6 < mean("principled", lightest, rough, 0.5) < 1.0
+    for colour, rough, metal in ((1.0, 0.2, 0.0), (1.0, 1.0, 0.0), (lightest, smoothest, 0.0), (0.97, 0.4, 0.3)):
+        white = {"type": "principled", "base_color": {"type": "rgb", "value": colour}}
+        expected, alpha = stock(scene, far, white | {"roughness": rough, "metallic": metal}, view, size, 1024)
+        assert mean("principled", colour, rough, metal) == pytest.approx(expected[alpha == 1].mean(), rel=5e-3)
 
 
 def test_bent_normals_gain_no_energy_and_leave_no_black_pixel(tmp_path: Path) -> None:

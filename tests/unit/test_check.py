@@ -95,6 +95,14 @@ def test_scene_level_warnings(make_scene: Make) -> None:
     assert "no emitter" in text and "base_prompt" in text
 
 
+def test_a_material_that_cannot_be_learned_is_told(make_scene: Make) -> None:
+    text = warnings(make_scene(part='<bsdf type="dielectric" id="part"/>'))
+    assert "--stage geometry" in text and "nothing to learn (a dielectric" in text
+    rough = '<bsdf type="principled"><float name="roughness" value="7"/></bsdf>'
+    text = warnings(make_scene(base=BASE.replace('<bsdf type="diffuse"/>', rough)))
+    assert "--stage geometry" in text and "roughness is 7" in text
+
+
 def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
     scene = load_edit_scene(make_scene())
     default = estimate_cost(scene, RunConfig())

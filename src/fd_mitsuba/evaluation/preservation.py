@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from fd_mitsuba.mitsuba_api import VERTICES
 from fd_mitsuba.render.appearance_pass import AppearancePass
-from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.render.gbuffer import GBuffer, Samples
 from fd_mitsuba.scene.views import CameraBatch
 
 MOST_DECIBELS = 200.0
@@ -28,7 +28,8 @@ class BasePreservation:
     base_psnr_db: over pixels that show nothing but the base and whose light the part does not touch, of linear
         radiance after exposure; `MOST_DECIBELS` where they are equal.
     untouched_share: how much of the base's pixels that are.
-    mask_error: the largest difference between alpha and the sum of the two sides of the mask.
+    mask_error: the largest difference between alpha and the sum of the two sides of the mask, each side counted from
+        the samples that its path shades: one that both shade, or neither, would show here.
     """
 
     base_psnr_db: float
@@ -60,9 +61,9 @@ def measure_preservation(
     counted = (whole & ~touched).expand(-1, 3, -1, -1)
     error = float((pair[0] - pair[1])[counted].square().mean()) if counted.any() else 0.0
     decibels = MOST_DECIBELS if error == 0 else min(-10 * float(np.log10(error)), MOST_DECIBELS)
-    sides = (edited.alpha - edited.part_mask - edited.base_mask).abs().max()
+    sides = _share(edited, edited.part_samples) + _share(edited, edited.base_samples)
     share = float((whole & ~touched).sum() / max(int(whole.sum()), 1))
-    return BasePreservation(decibels, share, float(sides))
+    return BasePreservation(decibels, share, float((edited.alpha - sides).abs().max()))
 
 
 def light_may_be_touched(gbuffer: GBuffer, solids: Sequence[np.ndarray]) -> torch.Tensor:
@@ -82,6 +83,13 @@ def light_may_be_touched(gbuffer: GBuffer, solids: Sequence[np.ndarray]) -> torc
             height[some] += (normals[some] @ corners.T).max(axis=1)
         touched[np.array(samples.lane)[height > 0] // gbuffer.spp] = True
     return torch.from_numpy(touched).reshape(views, 1, size, size)
+
+
+def _share(gbuffer: GBuffer, samples: Samples) -> torch.Tensor:
+    """(B, 1, S, S): how many of each pixel's samples are among `samples`, as a share."""
+    pixel = np.array(samples.lane, dtype=np.int64) // gbuffer.spp
+    counts = torch.from_numpy(np.bincount(pixel, minlength=gbuffer.pixels))
+    return (counts.float() / gbuffer.spp).view_as(gbuffer.alpha)
 
 
 def _vertices(part: mi.Mesh) -> np.ndarray:

@@ -101,6 +101,10 @@ class AppearancePass:
         fed = {name: self._shading.fed_value(name, np.asarray(value)) for name, value in values.items()}
         self.scene.set_vertex_values(self.part_names.index(part), fed)
 
+    def limit_bounces(self, radiance: float) -> None:
+        """For pictures, see `LightTransport.limit_bounces`; without it bounces are those of Mitsuba's `path`."""
+        self._transport.limit_bounces(radiance)
+
     def trace(self, cameras: CameraBatch, seed: int, size: int | None = None, spp: int | None = None) -> GBuffer:
         """What B cameras of the canonical frame see.
 

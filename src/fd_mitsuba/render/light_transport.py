@@ -49,6 +49,14 @@ class LightTransport:
         self._context = mi.BSDFContext()
         self._lights_have_shapes = any(shape.is_emitter() for shape in scene.shapes())
         self._stop = dr.opaque(mi.UInt32, max_depth if max_depth > 0 else 2**31)
+        self._brightest = dr.opaque(mi.Float, dr.inf)
+
+    def limit_bounces(self, radiance: float) -> None:
+        """Let what a single sample sees by way of another surface count for no more than this: for pictures.
+
+        A small lamp mirrored in a smooth part is found by few samples, which then are bright dots on the base.
+        """
+        self._brightest = dr.opaque(mi.Float, radiance)
 
     def incident(
         self, surface: mi.SurfaceInteraction3f, bsdf: Any, numbers: LightNumbers, stream: mi.UInt32, active: mi.Bool
@@ -58,7 +66,8 @@ class LightTransport:
             deeper = self.max_depth != 2
             light, ray, hit = self._vertex(surface, bsdf, numbers, active, need_surface=deeper)
             if deeper:
-                light.sampled_light += self._reflected(ray, hit, stream, active & hit.is_valid())
+                bounced = self._reflected(ray, hit, stream, active & hit.is_valid())
+                light.sampled_light += dr.minimum(bounced, self._brightest)
             return light
 
     def _vertex(

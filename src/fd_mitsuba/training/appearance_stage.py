@@ -1,7 +1,8 @@
 """One step of the appearance stage: texture field -> lit pictures -> guidance and style losses -> optimiser.
 
-L_app = lambda_sds L_SDS + lambda_style (L_g + lambda_boundary L_b)  (paper, "Appearance Editing" and supplement
-"Appearance Learning"). The base has no parameter here: what it looks like comes from the scene file alone.
+L_app = lambda_sds L_SDS + lambda_style (L_g + lambda_boundary L_b) + lambda_bend L_bend  (paper, "Appearance Editing"
+and supplement "Appearance Learning", which have no L_bend). The base has no parameter here: what it looks like comes
+from the scene file alone.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
 from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
+from fd_mitsuba.losses.bend import loss_bend
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
@@ -159,8 +161,11 @@ class AppearanceStage:
             values.update(result.logs)
         if self.style is not None:
             losses.update(self.style.losses(self.field, step))
+        if settings.lambda_bend > 0 and "normal" in self.material.learned:
+            losses["bend"] = loss_bend(texture.normal)
         weights = {
             "sds": settings.lambda_sds,
+            "bend": settings.lambda_bend,
             "style_gradient": settings.lambda_style,
             "style_boundary": settings.lambda_style * settings.lambda_boundary,
         }
