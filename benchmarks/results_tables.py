@@ -1,8 +1,9 @@
 """Put measured figures into docs/results.md: `python benchmarks/results_tables.py`.
 
-Reads what `fd_mitsuba evaluate --all --json runs/evaluate.json` and `fd_mitsuba ablate` left in `runs/` and rewrites
-the tables of docs/results.md between their markers, and the sheets of pictures beside it. What is missing leaves its
-table as it is. Whether a bar is met is computed here from the runs, failed ones included.
+Reads what `fd_mitsuba evaluate --all --json runs/evaluate.json`, the same with `--pictures shape` and
+`runs/evaluate_shape.json`, and `fd_mitsuba ablate` left in `runs/`, and rewrites the tables of docs/results.md between
+their markers, and the sheets of pictures beside it. What is missing leaves its table as it is. Whether a bar is met is
+computed here from the runs, failed ones included.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ ROUNDING = 1e-9
 JUDGED = ("sim", "dir", "dir_cosine", "sim_simple", "dir_simple")
 RANKED = ("rank", "rank_start", "rank_dir", "rank_dir_start", "rank_part", "rank_part_start")
 UNJUDGED = ("psnr", "ssim", "chamfer", "texture", "leakage", "overlap", "valid", "front_in_back", "seconds", "memory")
+UNJUDGED_SHAPE = ("chamfer", "texture", "leakage", "overlap", "valid", "front_in_back", "seconds", "memory")
 
 
 class Bar(NamedTuple):
@@ -149,6 +151,18 @@ def beside_the_paper(runs: Sequence[dict]) -> list[str]:
     return markdown_table(titles, rows).splitlines()
 
 
+def run_tables(runs: Sequence[dict], lost: Sequence[dict], kind: str) -> dict[str, list[str]]:
+    """The tables of runs that were judged by one kind of pictures; what does not depend on the pictures comes once."""
+    tables = {
+        f"bars {kind}": bars_table(run_bars(runs, len(lost))),
+        f"judged {kind}": scenes_table(runs, JUDGED),
+        f"ranks {kind}": scenes_table(runs, RANKED),
+        f"unjudged {kind}": scenes_table(runs, UNJUDGED if kind == "lit" else UNJUDGED_SHAPE),
+        "failed": [f"- {job['name']}: {job['message']}" for job in lost] or ["None."],
+    }
+    return tables | ({"paper": beside_the_paper(runs)} if kind == "lit" else {})
+
+
 def machine_lines() -> list[str]:
     """The machine that this is called on, which should be the one that made the runs."""
     from machine import machine
@@ -162,11 +176,11 @@ def machine_lines() -> list[str]:
     return [f"{about['cpu']}, {about['cores']} cores used, {int(memory) / 2**20:.0f} GB, no GPU; {versions}."]
 
 
-def scenes_sheet(runs: Sequence[dict], per_line: int = 2) -> Image.Image | None:
-    """Two views each of start and result of every run: a line a scene, its runs side by side."""
+def scenes_sheet(runs: Sequence[dict], name: str, per_line: int = 2) -> Image.Image | None:
+    """Two views each of start and result of every run, from its `images/<name>.png`: a strip a scene."""
     lines: dict[str, list[np.ndarray]] = {}
     for found in runs:
-        path = Path(found["run"]) / "images" / "evaluation.png"
+        path = Path(found["run"]) / "images" / f"{name}.png"
         if path.is_file():
             sheet = np.asarray(Image.open(path).convert("RGB"))
             side = sheet.shape[0] // 3
@@ -193,23 +207,18 @@ def main() -> int:
     options = parser.parse_args()
     page, pictures = options.page.read_text(encoding="utf-8"), options.page.parent / "images"
     tables: dict[str, list[str]] = {}
-    evaluated = options.runs / "evaluate.json"
-    if evaluated.is_file():
-        runs = json.loads(evaluated.read_text(encoding="utf-8"))["runs"]
-        batch = options.runs / "evaluate" / "batch.json"
-        jobs = json.loads(batch.read_text(encoding="utf-8"))["jobs"] if batch.is_file() else []
-        lost = [job for job in jobs if job["state"] == "failed"]
-        tables |= {
-            "machine": machine_lines(),
-            "bars": bars_table(run_bars(runs, len(lost))),
-            "judged": scenes_table(runs, JUDGED),
-            "ranks": scenes_table(runs, RANKED),
-            "unjudged": scenes_table(runs, UNJUDGED),
-            "paper": beside_the_paper(runs),
-        }
-        tables["failed"] = [f"- {job['name']}: {job['message']}" for job in lost] or ["None failed."]
-        if sheet := scenes_sheet(runs):
-            sheet.save(pictures / "results.jpg", quality=88)
+    batch = options.runs / "evaluate" / "batch.json"
+    jobs = json.loads(batch.read_text(encoding="utf-8"))["jobs"] if batch.is_file() else []
+    for kind, file in {"lit": "evaluate.json", "shape": "evaluate_shape.json"}.items():
+        if (options.runs / file).is_file():
+            runs = json.loads((options.runs / file).read_text(encoding="utf-8"))["runs"]
+            seeds = {found["seed"] for found in runs}  # the two files may have different ones
+            lost = [job for job in jobs if job["state"] == "failed" and job["seed"] in seeds]
+            tables |= run_tables(runs, lost, kind)
+            if sheet := scenes_sheet(runs, "evaluation" if kind == "lit" else "evaluation_shape"):
+                sheet.save(pictures / f"results_{kind}.jpg", quality=88)
+    if tables:
+        tables["machine"] = machine_lines()
     ablations = sorted(options.runs.glob("ablate_*/ablation.json"))
     lines: list[str] = []
     for path in ablations:

@@ -56,7 +56,10 @@ def filled(tmp_path: Path) -> str:
     states = ["finished"] * 4 + ["skipped", "failed"]
     (tmp_path / "runs" / "evaluate").mkdir(parents=True)
     (tmp_path / "runs" / "evaluate.json").write_text(json.dumps({"runs": runs}))
-    rows = [{"name": f"job-{i}", "state": state, "message": "it vanished"} for i, state in enumerate(states)]
+    shapes = [{**runs[0], "views": {"kind": "normals"}, "base": {**runs[0]["base"], "psnr_db": 60.0}}]
+    (tmp_path / "runs" / "evaluate_shape.json").write_text(json.dumps({"runs": shapes}))
+    rows = [{"name": f"job-{i}", "state": s, "message": "it vanished", "seed": 0} for i, s in enumerate(states)]
+    rows.append({**rows[-1], "name": "job-6", "seed": 7})  # of seeds that nobody has evaluated
     (tmp_path / "runs" / "evaluate" / "batch.json").write_text(json.dumps({"jobs": rows}))
     ablation = tmp_path / "runs" / "ablate_cat"
     ablation.mkdir()
@@ -80,8 +83,13 @@ def filled(tmp_path: Path) -> str:
 
 
 def test_bars_and_tables_follow_from_the_runs(filled: str, tmp_path: Path) -> None:
-    bars = {line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:4]] for line in filled.splitlines()
-            if line.count("|") == 4}  # fmt: skip
+    def bars_of(page: str) -> dict[str, list[str]]:
+        rows = [[cell.strip() for cell in line.split("|")] for line in page.splitlines() if line.count("|") == 4]
+        return {row[1]: row[2:4] for row in rows}
+
+    shape = bars_of(filled.split("<!-- table: bars shape -->")[1].split("<!-- end -->")[0])
+    assert shape["base preserved perfectly in all"] == ["1 of 2 (50%)", "**no**"]  # the failed run; 60 dB is the fillet
+    bars = bars_of(filled.split("<!-- table: bars lit -->")[1])
     assert bars["every run ends"] == ["5 of 6 (83%)", "**no**"]
     assert bars["prompt ranked first among all edit prompts in ≥ 80 %, by CLIP_sim"] == ["4 of 6 (67%)", "**no**"]
     assert bars["prompt ranked first in ≥ 80 %, by the change (CLIP_dir)"] == ["5 of 6 (83%)", "yes"]
@@ -93,10 +101,10 @@ def test_bars_and_tables_follow_from_the_runs(filled: str, tmp_path: Path) -> No
     assert bars["without the dual path the base's colour drifts"] == ["0.00000 → 0.10000", "yes"]
     assert "without L_SC the boundary step is higher" not in bars  # it was not run
     assert "| cat | 3 | a judge, lit | 0.400 ± 0.100 | 0.0500 ± 0.0000 | 0.200 ± 0.000 |" in filled
-    assert filled.count("- job-5: it vanished") == 1 and "job-0" not in filled
+    assert filled.count("- job-5: it vanished") == 1 and "job-0" not in filled and "job-6" not in filled
     assert "| ours, built-in prior (5 runs) | a judge, lit | 0.380" in filled and "0.0519" in filled
     assert filled.count("| run | of the ablation |") == 1 and "Not measured yet" not in filled
-    sheet = np.asarray(Image.open(tmp_path / "docs" / "images" / "results.jpg"))
+    sheet = np.asarray(Image.open(tmp_path / "docs" / "images" / "results_lit.jpg"))
     assert sheet[2, 4].max() < 60 and sheet[2, 16 + 8].min() > 200  # the start's two views, then the result's
 
 
