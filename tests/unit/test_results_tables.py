@@ -63,7 +63,7 @@ def filled(tmp_path: Path) -> str:
     (tmp_path / "runs" / "evaluate" / "batch.json").write_text(json.dumps({"jobs": rows}))
     ablation = tmp_path / "runs" / "ablate_cat"
     ablation.mkdir()
-    leaks = {"full": 0.01, "no_focal": 0.04, "no_collision": 0.01}
+    leaks = {"full": 0.01, "no_focal": 0.04, "no_collision": 0.01, "paper": 0.0, "paper_no_focal": 0.001}
     rows = [
         {"row": {"name": name}, "shape": [run("cat", 0, tmp_path / name, leakage=leak)], "lit": []}
         for name, leak in leaks.items()
@@ -98,6 +98,7 @@ def test_bars_and_tables_follow_from_the_runs(filled: str, tmp_path: Path) -> No
     assert bars["leakage ≤ 1 % in all"] == ["4 of 6 (67%)", "**no**"]
     assert bars["without L_GF leakage grows ≥ 5 times"] == ["1.00% → 4.00%, 4.0 times", "**no**"]
     assert bars["without L_CA overlap grows ≥ 3 times"] == ["2.00% → 8.00%, 4.0 times", "yes"]
+    assert bars["without L_GF leakage grows ≥ 5 times, the paper's losses alone"] == ["0.00% → 0.10%", "yes"]
     assert bars["without the dual path the base's colour drifts"] == ["0.00000 → 0.10000", "yes"]
     assert "without L_SC the boundary step is higher" not in bars  # it was not run
     assert "| cat | 3 | a judge, lit | 0.400 ± 0.100 | 0.0500 ± 0.0000 | 0.200 ± 0.000 |" in filled
