@@ -55,8 +55,8 @@ def _colour_scale(value: float, name: str) -> Row:
 
 
 _PAPER_LOSSES = ("geometry.lambda_volume=0", "geometry.lambda_presence=0")
-"""Without our own additions: a price on volume also takes away what leaves the region or hides in the base, where no
-picture holds it, so what L_GF and L_CA do shows in full only without it."""
+"""Without our own additions: a price on volume also takes away what hides in the base, where no picture holds it, and
+pulls in what leaves the region, so what L_GF and L_CA do by themselves shows only without it."""
 
 ROWS = (
     Row(FULL, "full method", (), "all", ("0.329 (0.319*)", "0.0519 (0.0495*)")),
