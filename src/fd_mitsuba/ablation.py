@@ -54,12 +54,19 @@ def _colour_scale(value: float, name: str) -> Row:
     return Row(name, title, (f"appearance.guidance_scale={value:g}",), "appearance")
 
 
+_PAPER_LOSSES = ("geometry.lambda_volume=0", "geometry.lambda_presence=0")
+"""Without our own additions: a price on volume also takes away what hides in the base, where no picture holds it, and
+pulls in what leaves the region, so what L_GF and L_CA do by themselves shows only without it."""
+
 ROWS = (
     Row(FULL, "full method", (), "all", ("0.329 (0.319*)", "0.0519 (0.0495*)")),
     Row("no_focal", "without L_GF", ("geometry.lambda_focal=0",), "geometry", ("0.316", "0.0433")),
     Row("no_collision", "without L_CA", ("geometry.lambda_collision=0",), "geometry", ("0.329", "0.0517")),
     Row("no_style", "without L_SC", ("appearance.style=false",), "appearance", ("0.312*", "0.0402*")),
     Row("single_path", "without dual path", ("appearance.single_path=true",), "appearance", ("0.313", "0.0401")),
+    Row("paper", "the paper's losses alone", _PAPER_LOSSES, "geometry"),
+    Row("paper_no_focal", "... without L_GF", (*_PAPER_LOSSES, "geometry.lambda_focal=0"), "geometry"),
+    Row("paper_no_collision", "... without L_CA", (*_PAPER_LOSSES, "geometry.lambda_collision=0"), "geometry"),
     _k(0.0, "k_0"),
     _k(0.05, "k_005"),
     _k(0.15, "k_015"),

@@ -6,9 +6,13 @@ import argparse
 import json
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fd_mitsuba.cli_options import machine_options, remark, start
 from fd_mitsuba.errors import UserError
+
+if TYPE_CHECKING:
+    from fd_mitsuba.evaluation.scene_prompts import ScenePrompts
 
 
 def judge_options(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +41,13 @@ def add_evaluate_commands(commands: argparse._SubParsersAction) -> None:
         "runs", nargs="*", metavar="RUN", help="run folders; a scene file is run first, as the options below say"
     )
     evaluate.add_argument(
-        "--all", action="store_true", help="every shipped scene that the built-in prior can read, run if need be"
+        "--all", action="store_true", help="every shipped scene that the guidance model can read, run if need be"
+    )
+    evaluate.add_argument(
+        "--stage",
+        choices=("all", "geometry"),
+        default="all",
+        help="geometry: scenes are run without appearance, in less than half of the time; default: all",
     )
     judge_options(evaluate)
     evaluate.add_argument(
@@ -63,7 +73,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     start(options)
     from rich.console import Console
 
-    from fd_mitsuba.evaluate import Protocol, builtin_vocabulary, evaluate_run
+    from fd_mitsuba.evaluate import Protocol, evaluate_run
+    from fd_mitsuba.evaluate_many import evaluate_at_once
     from fd_mitsuba.evaluation.clip import ClipJudge
     from fd_mitsuba.evaluation.scene_prompts import prompts_of_scenes
     from fd_mitsuba.evaluation.score_table import COLUMNS, SHORT, header, rich_table, score_rows, summary_lines
@@ -74,8 +85,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     rivals = prompts_of_scenes(Path(options.scenes)) if options.all or Path(options.scenes).is_dir() else []
     runs, scenes = [Path(run) for run in options.runs], []
     if options.all:
-        vocabulary = builtin_vocabulary()
-        scenes = [rival.scene for rival in rivals if vocabulary is None or rival.known_to(vocabulary)]
+        scenes = _readable_scenes(options, rivals)
     else:
         scenes = [run for run in runs if _is_scene(run)]
         runs = [run for run in runs if not _is_scene(run)]
@@ -83,10 +93,13 @@ def _evaluate(options: argparse.Namespace) -> int:
     if scenes:
         made, failed = run_scenes(options, scenes)
         runs += made
+    again = options.again
+    if options.workers > 1 and len(runs) > 1:
+        again = not evaluate_at_once(runs, options.workers, _as_given(options)) and again
     results = []
     for run in runs:
         try:
-            results.append(evaluate_run(run, judge, protocol, rivals, options.again))
+            results.append(evaluate_run(run, judge, protocol, rivals, again))
         except UserError as error:
             if len(runs) == 1:
                 raise
@@ -122,12 +135,44 @@ def _document(results: list[dict]) -> str:
     return "\n".join([*blocks, markdown_table(header(columns), score_rows(results, columns))])
 
 
+def _as_given(options: argparse.Namespace) -> list[str]:
+    """The options that say how runs are evaluated, for another process."""
+    words = ["--again"] if options.again else []
+    for name in ("judge", "views", "size", "spp", "pictures", "scenes", "variant"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name}", str(value)]
+    return words
+
+
+def _readable_scenes(options: argparse.Namespace, shipped: list[ScenePrompts]) -> list[Path]:
+    """The shipped scenes that the settings' guidance model can read; a remark says why the others are left out."""
+    from fd_mitsuba.config import load_config
+    from fd_mitsuba.evaluate import vocabulary_of
+    from fd_mitsuba.guidance.vocabulary import read_prompt
+
+    model = load_config(Path(options.config), options.overrides).guidance.model
+    vocabulary = vocabulary_of(model)
+    chosen = []
+    for found in shipped:
+        if vocabulary is None or found.known_to(vocabulary):
+            chosen.append(found.scene)
+        else:
+            words = ", ".join(map(repr, read_prompt(found.words.prompt, vocabulary).ignored))
+            remark(
+                f"{found.name}: left out, since {model} does not know {words or 'its part'}; "
+                "give --set guidance.model=<folder or hub id> of a Stable Diffusion"
+            )
+    return chosen
+
+
 def run_scenes(options: argparse.Namespace, scenes: list[Path]) -> tuple[list[Path], int]:
     """Run what is missing of scenes by seeds; the folders of the finished runs, and how many failed."""
     from fd_mitsuba.batch import job_matrix, run_batch
 
     folder = Path(options.output)
-    jobs = job_matrix(scenes, [Path(options.config)], options.seeds, options.overrides, folder)
+    jobs = job_matrix(scenes, [Path(options.config)], options.seeds, options.overrides, folder, stage=options.stage)
+    # One seed after the other, so that a batch that is stopped has something of every scene.
+    jobs.sort(key=lambda job: options.seeds.index(job.seed))
     outcomes = run_batch(jobs, options.workers, remark, record=folder / "batch.json")
     done = [outcome.job.folder for outcome in outcomes if outcome.state in ("finished", "skipped")]
     return done, len(outcomes) - len(done)

@@ -128,7 +128,13 @@ def views_sheet(views: JudgedViews) -> np.ndarray:
 
 def builtin_vocabulary() -> Vocabulary | None:
     """The words of the built-in prior; None if this installation has none."""
-    return read_model_conventions(BUILTIN_FOLDER).vocabulary if BUILTIN_FOLDER.is_dir() else None
+    return vocabulary_of("builtin")
+
+
+def vocabulary_of(model: str) -> Vocabulary | None:
+    """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion."""
+    folder = BUILTIN_FOLDER if model == "builtin" else Path(model)
+    return read_model_conventions(folder).vocabulary if folder.is_dir() else None
 
 
 def _shape_kind(judge: Judge) -> Literal["normals", "shaded"]:

@@ -33,6 +33,9 @@ def test_rows_change_what_they_say() -> None:
     assert full.seed == 2 and full.geometry.steps == 7 and full.appearance.style and jobs["full-2"].stage == "all"
     assert jobs["no_focal-0"].settings().geometry.lambda_focal == 0 and jobs["no_focal-0"].stage == "geometry"
     assert jobs["no_collision-0"].settings().geometry.lambda_collision == 0
+    alone = jobs["paper_no_collision-0"].settings().geometry
+    assert alone.lambda_collision == alone.lambda_volume == alone.lambda_presence == 0 < alone.lambda_focal
+    assert jobs["paper-0"].settings().geometry.lambda_collision > 0 == jobs["paper-0"].settings().geometry.lambda_volume
     assert not jobs["no_style-0"].settings().appearance.style
     assert jobs["single_path-0"].settings().appearance.single_path
     ks = [jobs[f"{name}-0"].settings().geometry.union_k for name in ("k_0", "k_005", "k_015", "k_03", "k_05")]

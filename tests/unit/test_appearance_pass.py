@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,7 @@ from appearance_setup import (
 from fd_mitsuba.config_sections import TextureConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.views import ring_views
 
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(CONSTANT["base_color"])}}
@@ -264,3 +266,17 @@ def test_values_must_fit_the_points_and_the_bsdf(sky: EditScene) -> None:
 def test_a_scene_without_light_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"scene\.xml: no emitter"):
         AppearancePass(blocks(tmp_path, ""), {}, shading("diffuse"))
+
+
+def test_a_part_leaves_the_lights_where_they_are(sky: EditScene) -> None:
+    """Not a digit of a ray to a light may depend on the part: the base's own shadows would flicker at their edges."""
+    mi = ready_mitsuba()
+    targets = []
+    for parts in ({}, {"part": ball(0.6, 0.4)}):
+        lit = AppearancePass(sky, parts, shading("diffuse")).scene.lit
+        surface = dr.zeros(mi.SurfaceInteraction3f, 64)
+        surface.p = mi.Point3f(0.4, 1.3, -0.3)
+        sampler = mi.PCG32(64)
+        numbers = mi.Point2f(sampler.next_float32(), sampler.next_float32())
+        targets.append(np.array(lit.sample_emitter_direction(surface, numbers, False)[0].p))
+    assert len(np.unique(targets[0], axis=1).T) > 10 and np.array_equal(*targets)

@@ -13,7 +13,7 @@ ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
     "conventions errors config_sections config mitsuba_api threads scene fields extraction render guidance losses "
     "training export evaluation prior cost check preview doctor geometry appearance pipeline parts cli_options "
-    "batch_job batch_record batch_ray batch cli_batch cli_report evaluate ablation ablation_table "
+    "batch_job batch_record batch_ray batch cli_batch cli_report evaluate evaluate_many ablation ablation_table "
     "cli_evaluate cli_ablate cli_export cli_prior cli __main__"
 ).split()
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

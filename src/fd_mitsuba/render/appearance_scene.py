@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
@@ -77,6 +78,7 @@ class AppearanceScene:
         lights = [light for light in loaded.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Surface)]
         lit = _scene([*base, *meshes, *lamps, *lights])
         visible = _scene([*base, *meshes]) if lamps else lit
+        _keep_at_distance(lights, loaded.shapes(), scene)
         return cls(lit, visible, meshes, tuple(base))
 
     def set_vertex_values(self, part: int, values: Mapping[str, np.ndarray]) -> None:
@@ -95,6 +97,24 @@ class AppearanceScene:
 def _scene(objects: list[Any]) -> mi.Scene:
     content = {f"object_{number}": value for number, value in enumerate(objects)}
     return mi.load_dict({"type": "scene", **content}, optimize=False, parallel=False)
+
+
+def _keep_at_distance(lights: list[Any], shapes: list[Any], scene: EditScene) -> None:
+    """Put lights from infinity on a sphere around the scene file's shapes and all that the grid could hold.
+
+    Mitsuba puts them on one around what is in the scene, so that a part would move it. Rays to a light would then
+    differ in their last digits, and where the base only just shades itself, pixels would change that the part has
+    nothing to do with.
+    """
+    bounds = mi.ScalarBoundingBox3f()
+    for shape in shapes:
+        bounds.expand(shape.bbox())
+    for corner in scene.frame.to_user(GRID_HALF_EXTENT * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])):
+        bounds.expand(mi.ScalarPoint3f(*corner))
+    middle, reach = np.array(bounds.center()), float(np.linalg.norm(np.array(bounds.extents()))) / 2
+    room = _scene([mi.load_dict({"type": "sphere", "center": middle.tolist(), "radius": reach})])
+    for light in lights:
+        light.set_scene(room)
 
 
 def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | None]) -> list[Any]:
