@@ -299,26 +299,6 @@ def test_gradient_from_the_passes_by_hand(folders: dict[str, Path], kind: str, v
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5)
 
 
-def test_a_difference_is_added_to_the_condition(folders: dict[str, Path], tmp_path: Path) -> None:
-    """e = (z_t - sqrt(abar) x) / sqrt(1 - abar): with x = answer + c instead of answer it is less by that much of c."""
-    noises = []
-    for predicts in ("picture", "difference"):
-        folder = shutil.copytree(folders["ip2p"], tmp_path / predicts)
-        edit_json(folder / "scheduler/scheduler_config.json", prediction_type="sample")
-        (folder / "fd_mitsuba.json").write_text(f'{{"predicts": "{predicts}"}}')
-        guidance = load(folder)
-        generator = torch.Generator().manual_seed(0)
-        z_t, condition = torch.randn(2, 2, 4, 16, 16, generator=generator)
-        texts = {name: guidance._embed(["a horse"] * 2) for name in ("text", "image", "plain")}
-        timesteps = torch.tensor([200, 700])
-        with torch.no_grad():
-            noises.append(guidance.predict_noise(z_t, timesteps, texts, condition))
-    abar = guidance.alpha_bars[timesteps].view(-1, 1, 1, 1)
-    for name, seen in {"text": condition, "image": condition, "plain": torch.zeros_like(condition)}.items():
-        expected = noises[0][name] - abar.sqrt() / (1 - abar).sqrt() * seen
-        torch.testing.assert_close(noises[1][name], expected, rtol=1e-4, atol=1e-5)
-
-
 def test_csd_of_a_network_that_ignores_the_text_is_zero(folders: dict[str, Path]) -> None:
     guidance = with_point_mass(folders["ip2p"], variant="csd")
     assert gradient_of(guidance, views_for(guidance, "coarse", 2), "coarse").abs().max() == 0
@@ -498,7 +478,6 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "conventions": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_gird": 2}'), "fd_mitsuba.json: view_gird"),
     "grid": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_grid": 3}'), "does not divide"),
     "base": (lambda f: (f / "fd_mitsuba.json").write_text('{"needs_base": true}'), "4 input channels"),
-    "difference": (lambda f: (f / "fd_mitsuba.json").write_text('{"predicts": "difference"}'), "8 input channels"),
 }
 
 

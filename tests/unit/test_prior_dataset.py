@@ -34,7 +34,7 @@ def test_data_follow_from_the_seed_and_go_on_after_a_kill(small_shards: None, tm
     for number in range(2):
         name = f"pairs_{number:05d}"
         one, two = (np.load(tmp_path / folder / f"{name}.npz") for folder in "ab")
-        assert all(np.array_equal(one[key], two[key]) for key in ("base", "edited", "rough", "changed"))
+        assert all(np.array_equal(one[key], two[key]) for key in ("base", "edited", "changed"))
         texts = [(tmp_path / folder / f"{name}.jsonl").read_text() for folder in "ab"]
         assert texts[0] == texts[1]
         assert not {(row["body"], row["part"]) for row in map(json.loads, texts[0].splitlines())} & HELD_OUT
@@ -52,10 +52,8 @@ def test_stored_pairs_are_those_that_were_drawn_and_can_be_trained_on(small_shar
     assert stored.captions == [pair.caption for pair in drawn[:10]] and len(stored) == 10
     for i, pair in enumerate(drawn[:10]):
         assert np.array_equal(stored.edited[i], pair.edited) and np.array_equal(stored.changed[i] > 0, pair.changed())
-        assert np.array_equal(stored.rough[i], pair.rough_start())
-    base, edited, rough, changed, captions = stored.batch(3)
-    assert base.shape == edited.shape == rough.shape == (3, 4, 64, 64)
-    assert changed.shape == (3, 1, 64, 64) and len(captions) == 3
+    base, edited, changed, captions = stored.batch(3)
+    assert base.shape == edited.shape == (3, 4, 64, 64) and changed.shape == (3, 1, 64, 64) and len(captions) == 3
     assert base.abs().max() <= 1 and set(changed.unique().tolist()) <= {0.0, 1.0}
     train(tmp_path / "run", seconds=60, batch_size=2, total_steps=1, pairs=stored)
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1

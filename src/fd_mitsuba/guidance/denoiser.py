@@ -10,7 +10,6 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
-from fd_mitsuba.guidance.model_conventions import FILE_NAME
 from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, Query, passes_of
 
 
@@ -33,12 +32,6 @@ class Denoiser:
                 f"{components.folder / 'scheduler'}: prediction_type {self.prediction_type!r} is not known; take a "
                 "model with epsilon or v_prediction"
             )
-        self._adds_condition = components.conventions.predicts == "difference"
-        if self._adds_condition and not (self.needs_base and self.prediction_type == "sample"):
-            raise UserError(
-                f"{components.folder / FILE_NAME}: predicts is difference, which takes a UNet with 8 input channels "
-                "and the prediction_type sample; mend predicts"
-            )
 
     def predict_noise(
         self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], condition: Tensor | None
@@ -51,7 +44,7 @@ class Denoiser:
             condition: the base's latents (N, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
         """
         passes, unet = len(texts), self.components.unet
-        inputs, seen = z_t, None
+        inputs = z_t
         if condition is not None:
             seen = [torch.zeros_like(condition) if name == "plain" else condition for name in texts]
             inputs = torch.cat([z_t.repeat(passes, 1, 1, 1), torch.cat(seen)], dim=1)
@@ -64,13 +57,10 @@ class Denoiser:
                 *(whole.split(self.config.views_per_call) for whole in (inputs, times, embeddings)), strict=True
             )
         ]
-        answers = torch.cat(outputs)
-        if seen is not None and self._adds_condition:
-            answers = answers + torch.cat(seen)
         alpha_bar = self.alpha_bars[timesteps]
         return {
-            name: sds.noise_from_prediction(answer, z_t, alpha_bar, self.prediction_type)
-            for name, answer in zip(texts, answers.chunk(passes), strict=True)
+            name: sds.noise_from_prediction(output, z_t, alpha_bar, self.prediction_type)
+            for name, output in zip(texts, torch.cat(outputs).chunk(passes), strict=True)
         }
 
     def passes(self, how: Distillation) -> tuple[str, ...]:

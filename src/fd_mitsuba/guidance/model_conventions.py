@@ -31,8 +31,6 @@ class ModelConventions(BaseModel):
     latents: Literal["vae", "area_mean_shine"] = "vae"
     """How colour pictures become latents: by the VAE, or by `colour_latents`, where shine is the fourth channel, and in
     the condition the part's coverage."""
-    predicts: Literal["picture", "difference"] = "picture"
-    """What the UNet's output stands for: with `difference`, how the clean latents differ from the condition's."""
     background: Literal["black", "white"] | None = None
     """Behind the objects of the training pictures, if always the same. For people, not checked."""
     prompt_template: str = "{prompt}, {closeup}, {view}"

@@ -16,11 +16,12 @@ from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import caption, random_style, view_words
 from fd_mitsuba.prior.parts import PARTS, resized
 from fd_mitsuba.prior.primitives import Solid
-from fd_mitsuba.prior.rough_parts import rough_part
 
 VIEW_SIZE = 32
 SUPERSAMPLING = 2
 CAMERA_RADIUS = 3.0
+LEAST_PIXELS = 12
+"""Of a mosaic that a part must change to be seen at all."""
 STYLED_SHARE = 0.3
 """Captions that also name a colour or material, which normals do not show: the words must not disturb the shape."""
 
@@ -39,30 +40,11 @@ class Pair:
 
     def changed(self) -> np.ndarray:
         """Where the part is (64, 64) bool: the pixels that count most in training."""
-        return differs(self.edited, self.base)
+        return np.abs(self.edited.astype(np.int16) - self.base).max(0) > 12
 
-    def rough_start(self) -> np.ndarray:
-        """The picture (4, 64, 64) of what a run might have there before it has the part; here the part itself."""
-        return self.edited
-
-
-@dataclass(frozen=True)
-class ShapePair(Pair):
-    """A pair of the geometry prior; `rough` (4, 64, 64) shows the body with `rough_parts.rough_part`."""
-
-    rough: np.ndarray
-
-    def changed(self) -> np.ndarray:
-        """Where the part or its rough start is (64, 64) bool."""
-        return differs(self.edited, self.base) | differs(self.rough, self.base)
-
-    def rough_start(self) -> np.ndarray:
-        return self.rough
-
-
-def differs(picture: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Where (H, W) bool two int8 latents (4, H, W) differ by a tenth or more in some channel."""
-    return np.abs(picture.astype(np.int16) - base).max(0) > 12
+    def shows_part(self) -> bool:
+        """Whether enough of the mosaic changes to see that there is a part."""
+        return bool(self.changed().sum() >= LEAST_PIXELS)
 
 
 class RayCaster:
@@ -167,41 +149,42 @@ def closeup_camera(part: Solid, rng: np.random.Generator) -> MosaicCamera:
     )
 
 
-def make_pairs(body: str, parts: list[str | None], seed: int) -> list[ShapePair]:
-    """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed).
-
-    None among the parts gives one picture of the body alone, whose rough start is that of some part: what nobody asked
-    for is to go away.
-    """
+def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
+    """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
     made = BODIES[body](rng)
     base_caster, overview, pairs = RayCaster(made.solid), global_camera(rng), []
-    overview_rays = overview.rays()
-    overview_hits = base_caster.cast(*overview_rays[:2])
-    # Drawn apart, so that pictures of a seed stay what they were before there were rough starts.
-    rough_rng = np.random.default_rng([seed, list(BODIES).index(body), 1])
+    overview_hits = None
     for part in parts:
         solid = None if part is None else resized(part, PARTS[part](made, rng), made, rng)
-        shown = solid
-        if shown is None:
-            shown = PARTS[str(rough_rng.choice(list(PARTS)))](made, rough_rng)
-        rough_caster = RayCaster(rough_part(shown, rough_rng))
         caster = None if solid is None else RayCaster(solid)
         cameras = [(overview, False)] if solid is None else [(overview, False), (closeup_camera(solid, rng), True)]
         for camera, closeup in cameras:
-            origins, directions, rotations = camera.rays() if closeup else overview_rays
-            base_hits = base_caster.cast(origins, directions) if closeup else overview_hits
-            hits = base_hits if caster is None else nearest(base_hits, caster.cast(origins, directions))
-            rough_hits = nearest(base_hits, rough_caster.cast(origins, directions))
+            origins, directions, rotations = camera.rays()
+            if closeup or overview_hits is None:
+                base_hits = base_caster.cast(origins, directions)
+                overview_hits = overview_hits if closeup else base_hits
+            else:
+                base_hits = overview_hits
+            distance, normal = base_hits
+            if caster is not None:
+                part_distance, part_normal = caster.cast(origins, directions)
+                nearer = part_distance < distance
+                distance, normal = (
+                    np.where(nearer, part_distance, distance),
+                    np.where(nearer[:, None], part_normal, normal),
+                )
             style = random_style(rng) if rng.random() < STYLED_SHARE else ""
             words = f"{caption(body, part, rng, style)}, {view_words(camera.azimuth_deg, closeup)}"
-            pictures = [shade(*seen, rotations) for seen in (base_hits, hits, rough_hits)]
-            base, edited, rough = pictures
-            pairs.append(ShapePair(base, edited, words, body, part, camera.azimuth_deg, closeup, rough))
+            pairs.append(
+                Pair(
+                    shade(*base_hits, rotations),
+                    shade(distance, normal, rotations),
+                    words,
+                    body,
+                    part,
+                    camera.azimuth_deg,
+                    closeup,
+                )
+            )
     return pairs
-
-
-def nearest(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (N,) and normals (N, 3) of the nearer of two casts of the same rays."""
-    nearer = other[0] < one[0]
-    return np.where(nearer, other[0], one[0]), np.where(nearer[:, None], other[1], one[1])

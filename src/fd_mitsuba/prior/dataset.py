@@ -1,6 +1,6 @@
 """Training pairs in files: made ahead, looked at, shared, and read again by `prior train --data`.
 
-A folder holds `dataset.json` and shards `pairs_00000.npz` (base, edited, rough: (N, 4, 64, 64) int8 in units of 1/127;
+A folder holds `dataset.json` and shards `pairs_00000.npz` (base, edited: (N, 4, 64, 64) int8 in units of 1/127;
 changed: (N, 64, 8) uint8, the part's pixels packed by `numpy.packbits`) with `pairs_00000.jsonl` beside them: a line a
 pair with its caption, body, part, first azimuth and whether it is a close-up.
 """
@@ -18,7 +18,7 @@ import torch
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.kinds import GEOMETRY, Kind
-from fd_mitsuba.prior.train import Batch, draw_pairs
+from fd_mitsuba.prior.train import draw_pairs
 from fd_mitsuba.training.checkpoint import write_atomically
 
 PAIRS_A_SHARD = 256
@@ -79,7 +79,7 @@ def read_record(folder: Path) -> dict:
 
 
 class StoredPairs:
-    """All pairs of a folder in memory (49 kB each), drawn at random.
+    """All pairs of a folder in memory (33 kB each), drawn at random.
 
     Raises:
         UserError: no data there, or of another kind of prior.
@@ -93,8 +93,8 @@ class StoredPairs:
         if not shards:
             raise UserError(f"{folder}: holds no shards yet; make some with fd_mitsuba prior build-data")
         loaded = [np.load(path) for path in shards]
-        self.base, self.edited, self.rough, packed = (
-            np.concatenate([shard[name] for shard in loaded]) for name in ("base", "edited", "rough", "changed")
+        self.base, self.edited, packed = (
+            np.concatenate([shard[name] for shard in loaded]) for name in ("base", "edited", "changed")
         )
         self.changed = np.unpackbits(packed, axis=-1)
         lines = [line for path in shards for line in path.with_suffix(".jsonl").read_text("utf-8").splitlines()]
@@ -107,14 +107,12 @@ class StoredPairs:
     def refresh(self, count: int) -> None:
         """Does nothing: what is stored is all there is."""
 
-    def batch(self, size: int) -> Batch:
+    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
         """As `train.Pairs.batch`."""
         chosen = self._rng.integers(len(self), size=size)
-        base, edited, rough = (
-            torch.from_numpy(data[chosen]).float() / 127 for data in (self.base, self.edited, self.rough)
-        )
+        base, edited = (torch.from_numpy(data[chosen]).float() / 127 for data in (self.base, self.edited))
         changed = torch.from_numpy(self.changed[chosen]).float()[:, None]
-        return Batch(base, edited, rough, changed, [self.captions[i] for i in chosen])
+        return base, edited, changed, [self.captions[i] for i in chosen]
 
 
 def _write_shard(folder: Path, number: int, size: int, seed: int, kind: Kind) -> None:
@@ -128,7 +126,6 @@ def _write_shard(folder: Path, number: int, size: int, seed: int, kind: Kind) ->
         data,
         base=np.stack([pair.base for pair in pairs]),
         edited=np.stack([pair.edited for pair in pairs]),
-        rough=np.stack([pair.rough_start() for pair in pairs]),
         changed=np.packbits(np.stack([pair.changed() for pair in pairs]), axis=-1),
     )
     lines = [

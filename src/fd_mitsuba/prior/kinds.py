@@ -51,11 +51,8 @@ class Kind:
         fresh_pairs: new training pairs a step.
         small_steps: first steps on pictures of half the size, a quarter of the cost: enough to learn what words mean.
         masked_noise: share of the pictures with noise on the part alone, as guidance with `mask_guidance` makes them.
-        rough_share: share of the pictures whose noise lies on the part's rough start (`rough_parts`) instead of on the
-            part itself, as it does in a run.
         prediction: what the UNet says of a noisy picture, as Diffusers names it: `v_prediction`, or `sample`, the clean
             one, which is the easiest to learn where most of it is a copy of the condition.
-        difference: whether the UNet says how the clean picture differs from the condition, rather than all of it.
         build_vae: the autoencoder that goes into the folder.
         conventions: written as `fd_mitsuba.json` beside `model_index.json`.
     """
@@ -74,9 +71,7 @@ class Kind:
     fresh_pairs: int
     small_steps: int
     masked_noise: float
-    rough_share: float
     prediction: str
-    difference: bool
     build_vae: Callable[[], AutoencoderTiny]
     conventions: dict[str, Any]
 
@@ -107,11 +102,9 @@ GEOMETRY = Kind(
     fresh_pairs=8,
     small_steps=1000,
     masked_noise=0.0,
-    rough_share=0.5,
     prediction="sample",
-    difference=True,
     build_vae=build_vae,
-    conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference"},
+    conventions={**_CONVENTIONS, "normal_space": "camera"},
 )
 APPEARANCE = Kind(
     name="appearance",
@@ -128,9 +121,7 @@ APPEARANCE = Kind(
     fresh_pairs=4,
     small_steps=3500,
     masked_noise=0.9,
-    rough_share=0.0,
     prediction="sample",
-    difference=False,
     build_vae=build_colour_vae,
     conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
 )

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import HELD_OUT
-from fd_mitsuba.prior.corpus import Pair, differs
+from fd_mitsuba.prior.corpus import Pair
 from fd_mitsuba.prior.kinds import GEOMETRY, Kind
 from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, encode_text, load_packed
 from fd_mitsuba.prior.parts import PARTS
@@ -25,8 +25,6 @@ OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
 """Bodies that most pictures show; the others keep the copying of the base general."""
 _BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
 _BODY_SHARES /= _BODY_SHARES.sum()
-LEAST_PIXELS = 12
-"""Of a mosaic that must change for a pair to be trained on."""
 PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0) | dict.fromkeys(
     ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
 )
@@ -46,17 +44,7 @@ def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
     if rng.random() < 0.5:
         parts.append(None)
     pairs = kind.make_pairs(body, parts, int(rng.integers(2**31)))
-    return [pair for pair in pairs if pair.part is None or differs(pair.edited, pair.base).sum() >= LEAST_PIXELS]
-
-
-class Batch(NamedTuple):
-    """Latents (N, 4, 64, 64) in [-1, 1] without, with, and with the rough part, its pixels (N, 1, 64, 64), captions."""
-
-    base: torch.Tensor
-    edited: torch.Tensor
-    rough: torch.Tensor
-    changed: torch.Tensor
-    captions: list[str]
+    return [pair for pair in pairs if pair.part is None or pair.shows_part()]
 
 
 class Pairs(Protocol):
@@ -65,8 +53,8 @@ class Pairs(Protocol):
     def refresh(self, count: int) -> None:
         """Bring `count` more pairs in, if that is how it works."""
 
-    def batch(self, size: int) -> Batch:
-        """`size` random pairs."""
+    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
+        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
         ...
 
 
@@ -86,15 +74,13 @@ class Pool:
             self._pairs.extend(made)
             self._owed -= len(made)
 
-    def batch(self, size: int) -> Batch:
-        """`size` random pairs."""
+    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
+        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
         chosen = [self._pairs[i] for i in self._rng.integers(len(self._pairs), size=size)]
-        base, edited, rough = (
-            torch.from_numpy(np.stack(pictures)).float() / 127
-            for pictures in zip(*((pair.base, pair.edited, pair.rough_start()) for pair in chosen), strict=True)
-        )
-        changed = torch.from_numpy(np.stack([pair.changed() for pair in chosen])).float()[:, None]
-        return Batch(base, edited, rough, changed, [pair.caption for pair in chosen])
+        base = torch.from_numpy(np.stack([p.base for p in chosen])).float() / 127
+        edited = torch.from_numpy(np.stack([p.edited for p in chosen])).float() / 127
+        changed = torch.from_numpy(np.stack([p.changed() for p in chosen])).float()[:, None]
+        return base, edited, changed, [p.caption for p in chosen]
 
 
 def train(
@@ -160,9 +146,9 @@ def train(
         rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
         for group in optimiser.param_groups:
             group["lr"] = rate
-        base, edited, rough, changed, captions = pool.batch(batch_size)
+        base, edited, changed, captions = pool.batch(batch_size)
         if step < small_steps:
-            base, edited, rough = (avg_pool2d(pictures, 2) for pictures in (base, edited, rough))
+            base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
             changed = (avg_pool2d(changed, 2) > 0.4).float()
         draw = torch.rand(batch_size, generator=generator).tolist()
         captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
@@ -172,18 +158,13 @@ def train(
         if kind.masked_noise:
             masked = torch.rand(batch_size, generator=generator) < kind.masked_noise
             noise = torch.where(masked[:, None, None, None], noise * changed, noise)
-        seen = edited
-        if kind.rough_share:
-            is_rough = torch.rand(batch_size, generator=generator) < kind.rough_share
-            seen = torch.where(is_rough[:, None, None, None], rough, edited)
         a = alphas[times][:, None, None, None]
-        noisy = a.sqrt() * seen + (1 - a).sqrt() * noise
+        noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
         target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
-        condition = base * keep_base
-        inputs = torch.cat([noisy, condition], 1).contiguous(memory_format=torch.channels_last)
+        condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            predicted = unet(inputs, times, encode_text(tokenizer, encoder, captions)).sample
-        predicted = predicted.float() + condition if kind.difference else predicted.float()
+            predicted = unet(condition, times, encode_text(tokenizer, encoder, captions)).sample
+        predicted = predicted.float()
         error = squared_error(predicted - target, kind.tint_weight)
         loss = (error * (1 + kind.part_weight * changed)).mean()
         if kind.copy_weight:
