@@ -116,7 +116,7 @@ def test_a_material_prompt_without_a_known_part_is_refused(
     place: Path, finished: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--from", str(finished), "--prompt", "a pig with a spoon", "--set", "guidance.model=builtin"]
-    assert run(place, "spoon", *words) == 1
+    assert run(place, "spoon", *words, "--set", "appearance.views=4") == 1
     error = capfd.readouterr().err
     assert "knows no such part" in error and "Traceback" not in error
 
