@@ -62,11 +62,11 @@ def scenes_table(runs: Sequence[dict], names: Sequence[str]) -> list[str]:
 
 
 def preserved(found: dict) -> bool:
-    """Whether nothing of the base has changed: files, surface, textures, and pixels where they can be compared.
+    """Whether nothing of the base has changed: exported files and surface, and in lit runs textures and pixels.
 
     A bare shape is exported without the base's textures, and its pictures have a fillet where the part begins, so that
-    their pixels say nothing: of it only the mesh counts. 200 dB is a difference of
-    1e-10: a camera ray through the very edge of two triangles may name either, and the last digit follows.
+    their pixels say nothing. 200 dB is a difference of 1e-10: a camera ray through the very edge of two triangles may
+    name either, and the last digit follows.
     """
     base = found["base"]
     same = base["identical"] and base["files_identical"] == base["files"]
@@ -78,7 +78,7 @@ def preserved(found: dict) -> bool:
 
 def run_bars(runs: Sequence[dict], failed: int) -> list[Bar]:
     """What is asked of the runs; a failed one counts against each of them, a start that was not measured for none."""
-    total = len(runs) + failed
+    total, lit = len(runs) + failed, any(found["views"]["kind"] == "lit" for found in runs)
 
     def rank(name: str) -> Callable[[dict], bool]:
         return lambda found: OURS[name].value(found) == 1
@@ -100,7 +100,7 @@ def run_bars(runs: Sequence[dict], failed: int) -> list[Bar]:
         share("part ranked first on its own body in ≥ 80 %", rank("rank_part"), 0.8),
         start("... and for the start in ≤ 25 %", rank("rank_part_start")),
         share("CLIP_dir > 0 in all", lambda found: (OURS["dir"].value(found) or 0) > 0),
-        share("base preserved perfectly in all", preserved),
+        share(f"base preserved perfectly in all{'' if lit else ' (its mesh; textures and pixels: lit)'}", preserved),
         share("leakage ≤ 1 % in all", lambda found: found["part"]["leakage"] <= 0.01),
         share("no part lost", lambda found: not any(part["lost"] for part in found["part"]["parts"].values())),
         share("all parts closed solids", lambda found: all(p["valid"] for p in found["part"]["parts"].values())),

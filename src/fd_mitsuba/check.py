@@ -179,7 +179,7 @@ def _region_warnings(regions: tuple[RegionCheck, ...], config: RunConfig) -> lis
     warnings = []
     for region in regions:
         name = f"region {region.name}"
-        if region.share_in_grid < 0.999:  # a cap of half a percent is a tenth of an ellipsoid's depth, cut flat
+        if region.share_in_grid < 0.999:  # half a percent is a cap of 8 % of a half-axis, flat for all to see
             warnings.append(
                 f"{name}: {1 - region.share_in_grid:.1%} of it lies outside the grid and cannot be edited; "
                 "move or shrink it until it fits the grid's extent above"

@@ -88,7 +88,8 @@ def test_bars_and_tables_follow_from_the_runs(filled: str, tmp_path: Path) -> No
         return {row[1]: row[2:4] for row in rows}
 
     shape = bars_of(filled.split("<!-- table: bars shape -->")[1].split("<!-- end -->")[0])
-    assert shape["base preserved perfectly in all"] == ["1 of 2 (50%)", "**no**"]  # the failed run; 60 dB is the fillet
+    mesh = shape["base preserved perfectly in all (its mesh; textures and pixels: lit)"]
+    assert mesh == ["1 of 2 (50%)", "**no**"]  # the failed run; 60 dB is the fillet
     bars = bars_of(filled.split("<!-- table: bars lit -->")[1])
     assert bars["every run ends"] == ["5 of 6 (83%)", "**no**"]
     assert bars["prompt ranked first among all edit prompts in ≥ 80 %, by CLIP_sim"] == ["4 of 6 (67%)", "**no**"]

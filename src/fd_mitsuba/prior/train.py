@@ -102,7 +102,7 @@ def train(
         kind: which prior.
         init: optional folder of packed weights to start from instead of random ones; no step is small then.
         pairs: what to train on instead of freshly rendered pictures.
-        half: multiply in bfloat16: 1.5 times as fast on a processor that has it, slower on others.
+        half: multiply in bfloat16: faster on a processor that has it, slower on others.
     """
     files = TrainingFolder(folder)
     torch.manual_seed(seed)
