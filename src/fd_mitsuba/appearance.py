@@ -37,7 +37,7 @@ from fd_mitsuba.training.step_views import check_views
 
 _SHEET_VIEWS = 8
 _VIDEO_SPP, _SHEET_SPP = 12, 32
-_BRIGHTEST_BOUNCE = 4.0
+_BRIGHTEST_BOUNCE = 1.0
 """What a sample may see by way of another surface in the pictures of `render_run`, in units of the picture's white."""
 CUTS_UNKNOWN = (
     "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "

@@ -36,7 +36,7 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
     render.add_argument("-o", "--output", metavar="NAME", help="name of the pictures in RUN/renders; default: render")
     render.add_argument("--views", type=int, default=8, metavar="N", help="pictures around the object; default: 8")
     render.add_argument("--size", type=int, default=256, metavar="N", help="pixels a side; default: 256")
-    render.add_argument("--spp", type=int, default=64, metavar="N", help="samples a pixel; default: 64")
+    render.add_argument("--spp", type=int, default=128, metavar="N", help="samples a pixel; default: 128")
     render.add_argument("--depth", type=int, default=3, metavar="N", help="Mitsuba's max_depth; default: 3")
     machine_options(render)
     render.set_defaults(call=_render)
