@@ -9,7 +9,7 @@ whose transposes are the backward pass. Slots and matrices are constants. The pr
 results, comes last. It leaves out the box's columns without a site, a third of them around ellipsoids, and a large box
 is cut into slabs for it: a slab reads a few lattice planes of each level only, and its results stay in the cache.
 
-Summing the gradient of vertices that share a row is a segmented sum in a fixed order, so repeated runs agree.
+Gradients of vertices that share a row are added one after another in a fixed order, so repeated runs agree.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
 from fd_mitsuba.fields.hash_grid import HashGrid
 
@@ -43,14 +42,6 @@ class _BoxLevel:
     """(z * y * x) table row of each lattice vertex, int64."""
     in_columns: bool
     """Whether along x and y lattice vertices are sites: then y and x are one, and hold the box's columns only."""
-    order: Tensor
-    """Lattice vertices sorted by row."""
-    starts: Tensor
-    """Where each used row begins in `order`."""
-    used_rows: Tensor
-    """The rows, ascending, that the box reads."""
-    shares_rows: bool
-    """Whether several lattice vertices have the same row."""
 
 
 @dataclass(frozen=True)
@@ -206,11 +197,7 @@ class LatticeSites:
                     values = values if along_x is None else values @ along_x
                 values = values.reshape(self._features, -1)
                 for feature in range(self._features):
-                    if level.shares_rows:
-                        sums = embedding_bag(level.order, values[feature, :, None], level.starts, mode="sum")
-                        total[feature].index_add_(0, level.used_rows, sums[:, 0])
-                    else:
-                        total[feature].index_add_(0, level.slots, values[feature])
+                    total[feature].index_add_(0, level.slots, values[feature])
         return total
 
     def _planes_back(self, gradient: Tensor, chosen: Tensor, box: _Box, cuts: list[int]) -> list[Tensor]:
@@ -292,14 +279,8 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) 
     if in_columns:
         slots = slots[:, columns]
     slots = slots.reshape(-1) + grid.first_row[level]
-    ordered, order = slots.sort(stable=True)
-    used_rows, counts = ordered.unique_consecutive(return_counts=True)
-    starts = counts.cumsum(0) - counts
     shape = (len(keys[2]), len(keys[1]), len(keys[0]))
-    box_level = _BoxLevel(
-        (matrices[0], matrices[1]), shape, slots, in_columns, order, starts, used_rows, len(used_rows) < len(slots)
-    )
-    return box_level, matrices[2]
+    return _BoxLevel((matrices[0], matrices[1]), shape, slots, in_columns), matrices[2]
 
 
 def _slabs(depth: int, columns: int, inside: Tensor, begin: int, along_z: Sequence[Tensor | None]) -> Iterator[_Slab]:

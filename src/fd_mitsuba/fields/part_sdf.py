@@ -20,7 +20,7 @@ from fd_mitsuba.fields.hash_grid import HashGrid
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.mlp import ColumnMlp
 
-_PIECE = 4096
+_PIECE = 16384
 """Points at once, so that the perceptron's inputs and outputs stay in the processor's cache."""
 
 
