@@ -144,6 +144,8 @@ def test_front_in_back_counts_back_views_that_look_like_the_front() -> None:
     janus[:, 0] = janus[:, 0].abs()
     found = front_in_back(janus, base, azimuth)
     assert found.share == 1 and found.base_share == 0 and found.confusion == 0 and found.excess == 1
+    hat = base + torch.tensor([0.6, 0.0, 2.0])  # the same in every view, and by chance nearer to the base's front
+    assert front_in_back(hat, base, azimuth).excess == 0
     blind = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert front_in_back(blind, blind, azimuth).excess is None
     assert front_in_back(base[:3], base[:3], azimuth[:3]) is None

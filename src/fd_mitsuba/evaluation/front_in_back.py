@@ -11,6 +11,8 @@ from torch import Tensor
 from fd_mitsuba.evaluation.similarity import unit
 from fd_mitsuba.scene.views import view_label
 
+_LEAST_LEAN = 0.25
+"""A back view that leans to the back by less than this share of what the base's do on average is mistaken."""
 MOST_CONFUSION = 0.25
 """A judge that errs more often than this about the base itself cannot say anything about the edit."""
 
@@ -18,7 +20,7 @@ MOST_CONFUSION = 0.25
 @dataclass(frozen=True)
 class FrontInBack:
     """Attributes:
-    share: of the edited object's back views, those that are nearer to the front of the base than to its back.
+    share: of the edited object's back views, those that do not lean to the back as the base's do.
     base_share: the same of the base's own back views, each left out of the mean that it is compared with.
     confusion: share of the base's front and back views, left out likewise, that the judge takes for the other side.
     excess: `share - base_share`, the score; None where the confusion exceeds `MOST_CONFUSION`.
@@ -34,8 +36,10 @@ def front_in_back(edited: Tensor, base: Tensor, azimuth_deg: np.ndarray) -> Fron
     """The score of one ring of views; None where the ring has fewer than two views of the front or of the back.
 
     A front that the edit has put on the back, as SDS guidance may, makes back views look like front views. What looks
-    like the front is learned from the base's own pictures, so no words for sides are needed: `e` is nearer to the front
-    if `e . mean(front) > e . mean(back)` for unit features.
+    like the front is learned from the base's own pictures, so no words for sides are needed. With the direction
+    a = mean(front) - mean(back) of unit features, a view e leans by (e - m) . a, where m is the middle between front
+    and back of the object that it shows: what an edit adds to every view alike, such as a round hat, says nothing about
+    sides. A back view is mistaken if it does not lean to the back by a quarter, at least, of what the base's do.
 
     Args:
         edited, base: (N, D) features of equal views.
@@ -46,18 +50,26 @@ def front_in_back(edited: Tensor, base: Tensor, azimuth_deg: np.ndarray) -> Fron
     if min(len(front), len(back)) < 2:
         return None
     edited, base = unit(edited), unit(base)
-    sides = base[front], base[back]
-    share = float((_lean(edited[back], *sides) > 0).double().mean())
-    as_front = [_lean(base[[i]], sides[0], _without(base, back, i)) > 0 for i in back]
-    as_back = [_lean(base[[i]], _without(base, front, i), sides[1]) <= 0 for i in front]
+    mistaken = _not_back(edited[back], (base[front], base[back]), (edited[front], edited[back]))
+    as_front = [_not_back(base[[i]], (base[front], _without(base, back, i))) for i in back]
+    as_back = [~_not_back(base[[i]], (_without(base, front, i), base[back])) for i in front]
     base_share = float(torch.cat(as_front).double().mean())
     confusion = float(torch.cat(as_front + as_back).double().mean())
+    share = float(mistaken.double().mean())
     return FrontInBack(share, base_share, confusion, share - base_share if confusion <= MOST_CONFUSION else None)
 
 
-def _lean(rows: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """Positive where a row is nearer to the front."""
-    return rows @ (unit(front.mean(0)) - unit(back.mean(0)))
+def _not_back(rows: Tensor, base: tuple[Tensor, Tensor], own: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """Which rows do not lean to the back as they should.
+
+    Args:
+        base: features of the base's front, and of its back.
+        own: of the object that `rows` show, if it is another one.
+    """
+    front, back = (side.mean(0) for side in base)
+    axis = unit(front) - unit(back)
+    middle = torch.cat([side.mean(0, keepdim=True) for side in own or base]).mean(0)
+    return (rows - middle) @ axis > _LEAST_LEAN * ((back - front) / 2) @ axis
 
 
 def _without(features: Tensor, rows: list[int], left_out: int) -> Tensor:
