@@ -210,6 +210,24 @@ def test_instruct_pix2pix_step_equals_the_pipelines_own(folders: dict[str, Path]
         torch.testing.assert_close(condition, pipeline.vae.encode(colour).latent_dist.mode())
 
 
+def test_a_network_that_says_the_difference_is_added_to_what_it_saw(folders: dict[str, Path], tmp_path: Path) -> None:
+    """The clean latents that its noise implies are its output plus the condition, or plus nothing in the plain pass."""
+    folder = shutil.copytree(folders["ip2p"], tmp_path / "difference")
+    edit_json(folder / "scheduler/scheduler_config.json", prediction_type="sample")
+    (folder / "fd_mitsuba.json").write_text('{"predicts": "difference"}')
+    guidance = load(folder)
+    generator = torch.Generator().manual_seed(2)
+    z_t, condition = (torch.randn(2, 4, 16, 16, generator=generator) for _ in range(2))
+    t, texts = torch.tensor([300, 800]), {name: guidance._embed(["a horse"] * 2) for name in ("text", "plain")}
+    alpha_bar = guidance.alpha_bars[t].view(-1, 1, 1, 1)
+    with torch.no_grad():
+        noise = guidance.predict_noise(z_t, t, texts, condition)
+        for name, seen in (("text", condition), ("plain", torch.zeros_like(condition))):
+            said = guidance.components.unet(torch.cat([z_t, seen], 1), t, texts[name]).sample
+            clean = (z_t - (1 - alpha_bar).sqrt() * noise[name]) / alpha_bar.sqrt()
+            torch.testing.assert_close(clean, said + seen, rtol=1e-3, atol=1e-3)
+
+
 def test_refined_latents_are_scaled_as_for_image_to_image(folders: dict[str, Path]) -> None:
     guidance = load(folders["sd15"])
     views = views_for(guidance, "refined", 1)
@@ -478,6 +496,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "conventions": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_gird": 2}'), "fd_mitsuba.json: view_gird"),
     "grid": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_grid": 3}'), "does not divide"),
     "base": (lambda f: (f / "fd_mitsuba.json").write_text('{"needs_base": true}'), "4 input channels"),
+    "difference": (
+        lambda f: (f / "fd_mitsuba.json").write_text('{"predicts": "difference"}'),
+        "fd_mitsuba.json: predicts difference",
+    ),
 }
 
 

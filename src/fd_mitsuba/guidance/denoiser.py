@@ -10,13 +10,15 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
+from fd_mitsuba.guidance.model_conventions import FILE_NAME
 from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, Query, passes_of
 
 
 class Denoiser:
     """The UNet with its noise schedule.
 
-    A UNet with 8 input channels sees a condition's latents beside z_t (`needs_base`).
+    A UNet with 8 input channels sees a condition's latents beside z_t (`needs_base`), and may say only what must be
+    added to them (`adds_to_base`).
     """
 
     def __init__(self, components: Components, config: GuidanceConfig, device: str = "cpu") -> None:
@@ -24,6 +26,7 @@ class Denoiser:
         self.components = components
         self.device = torch.device(device)
         self.needs_base = components.unet.config.in_channels == 8
+        self.adds_to_base = components.conventions.predicts == "difference"
         self.latent_size = latent_side(components.unet.config)
         self.alpha_bars = components.scheduler.alphas_cumprod.to(device=self.device, dtype=torch.float32)
         self.prediction_type = components.scheduler.config.get("prediction_type", "epsilon")
@@ -31,6 +34,11 @@ class Denoiser:
             raise UserError(
                 f"{components.folder / 'scheduler'}: prediction_type {self.prediction_type!r} is not known; take a "
                 "model with epsilon or v_prediction"
+            )
+        if self.adds_to_base and not (self.needs_base and self.prediction_type == "sample"):
+            raise UserError(
+                f"{components.folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels and prediction_type "
+                "sample; remove the entry"
             )
 
     def predict_noise(
@@ -44,7 +52,7 @@ class Denoiser:
             condition: the base's latents (N, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
         """
         passes, unet = len(texts), self.components.unet
-        inputs = z_t
+        inputs, seen = z_t, []
         if condition is not None:
             seen = [torch.zeros_like(condition) if name == "plain" else condition for name in texts]
             inputs = torch.cat([z_t.repeat(passes, 1, 1, 1), torch.cat(seen)], dim=1)
@@ -57,6 +65,8 @@ class Denoiser:
                 *(whole.split(self.config.views_per_call) for whole in (inputs, times, embeddings)), strict=True
             )
         ]
+        if self.adds_to_base:
+            outputs = [torch.cat(outputs) + torch.cat(seen)]
         alpha_bar = self.alpha_bars[timesteps]
         return {
             name: sds.noise_from_prediction(output, z_t, alpha_bar, self.prediction_type)

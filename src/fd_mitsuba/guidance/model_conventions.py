@@ -31,6 +31,9 @@ class ModelConventions(BaseModel):
     latents: Literal["vae", "area_mean_shine"] = "vae"
     """How colour pictures become latents: by the VAE, or by `colour_latents`, where shine is the fourth channel, and in
     the condition the part's coverage."""
+    predicts: Literal["clean", "difference"] = "clean"
+    """What a UNet with prediction type `sample` says: the clean latents, or what must be added to the condition's as
+    the VAE gives them, without a scaling factor."""
     background: Literal["black", "white"] | None = None
     """Behind the objects of the training pictures, if always the same. For people, not checked."""
     prompt_template: str = "{prompt}, {closeup}, {view}"

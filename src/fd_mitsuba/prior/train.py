@@ -164,7 +164,7 @@ def train(
         condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
             predicted = unet(condition, times, encode_text(tokenizer, encoder, captions)).sample
-        predicted = predicted.float()
+        predicted = predicted.float() + base * keep_base if kind.difference else predicted.float()
         error = squared_error(predicted - target, kind.tint_weight)
         loss = (error * (1 + kind.part_weight * changed)).mean()
         if kind.copy_weight:

@@ -109,7 +109,8 @@ def cape(body: Body, rng: Rng) -> Solid:
 def backpack(body: Body, rng: Rng) -> Solid:
     """A rounded pack with a flap and a pocket on the back."""
     points, outward = body.spine(5)
-    at, away = (points[1] + points[2]) / 2, outward[2]
+    at = (points[2] + points[3] if body.upright else points[1] + points[2]) / 2
+    away = outward[2]
     wide, tall = jitter(rng, 0.3) * max(body.reach, 0.55), jitter(rng, 0.36) * max(body.reach, 0.55)
     deep = 0.6 * wide
     if body.upright:
