@@ -11,8 +11,6 @@ from torch import Tensor
 from fd_mitsuba.evaluation.similarity import unit
 from fd_mitsuba.scene.views import view_label
 
-_LEAST_LEAN = 0.25
-"""A back view that leans to the back by less than this share of what the base's do on average is mistaken."""
 MOST_CONFUSION = 0.25
 """A judge that errs more often than this about the base itself cannot say anything about the edit."""
 
@@ -20,7 +18,7 @@ MOST_CONFUSION = 0.25
 @dataclass(frozen=True)
 class FrontInBack:
     """Attributes:
-    share: of the edited object's back views, those that do not lean to the back as the base's do.
+    share: of the edited object's back views, those that lean to the front.
     base_share: the same of the base's own back views, each left out of the mean that it is compared with.
     confusion: share of the base's front and back views, left out likewise, that the judge takes for the other side.
     excess: `share - base_share`, the score; None where the confusion exceeds `MOST_CONFUSION`.
@@ -39,7 +37,7 @@ def front_in_back(edited: Tensor, base: Tensor, azimuth_deg: np.ndarray) -> Fron
     like the front is learned from the base's own pictures, so no words for sides are needed. With the direction
     a = mean(front) - mean(back) of unit features, a view e leans by (e - m) . a, where m is the middle between front
     and back of the object that it shows: what an edit adds to every view alike, such as a round hat, says nothing about
-    sides. A back view is mistaken if it does not lean to the back by a quarter, at least, of what the base's do.
+    sides. A back view is mistaken if it leans to the front; where front and back look the same, half of them do.
 
     Args:
         edited, base: (N, D) features of equal views.
@@ -50,17 +48,17 @@ def front_in_back(edited: Tensor, base: Tensor, azimuth_deg: np.ndarray) -> Fron
     if min(len(front), len(back)) < 2:
         return None
     edited, base = unit(edited), unit(base)
-    mistaken = _not_back(edited[back], (base[front], base[back]), (edited[front], edited[back]))
-    as_front = [_not_back(base[[i]], (base[front], _without(base, back, i))) for i in back]
-    as_back = [~_not_back(base[[i]], (_without(base, front, i), base[back])) for i in front]
+    mistaken = _leans_to_front(edited[back], (base[front], base[back]), (edited[front], edited[back]))
+    as_front = [_leans_to_front(base[[i]], (base[front], _without(base, back, i))) for i in back]
+    as_back = [~_leans_to_front(base[[i]], (_without(base, front, i), base[back])) for i in front]
     base_share = float(torch.cat(as_front).double().mean())
     confusion = float(torch.cat(as_front + as_back).double().mean())
     share = float(mistaken.double().mean())
     return FrontInBack(share, base_share, confusion, share - base_share if confusion <= MOST_CONFUSION else None)
 
 
-def _not_back(rows: Tensor, base: tuple[Tensor, Tensor], own: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Which rows do not lean to the back as they should.
+def _leans_to_front(rows: Tensor, base: tuple[Tensor, Tensor], own: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """Which rows lean to the front.
 
     Args:
         base: features of the base's front, and of its back.
@@ -69,7 +67,7 @@ def _not_back(rows: Tensor, base: tuple[Tensor, Tensor], own: tuple[Tensor, Tens
     front, back = (side.mean(0) for side in base)
     axis = unit(front) - unit(back)
     middle = torch.cat([side.mean(0, keepdim=True) for side in own or base]).mean(0)
-    return (rows - middle) @ axis > _LEAST_LEAN * ((back - front) / 2) @ axis
+    return (rows - middle) @ axis > 0
 
 
 def _without(features: Tensor, rows: list[int], left_out: int) -> Tensor:
