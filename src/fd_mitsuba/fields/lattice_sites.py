@@ -5,7 +5,8 @@ vertex once instead of eight times per site, and the interpolation becomes three
 
     box = (A_z x A_y x A_x) rows[slots],
 
-whose transposes are the backward pass. Slots and matrices are constants. The product along z, which has the most
+whose transposes are the backward pass. Slots and matrices are constants. A site reads two lattice vertices an axis, so
+that most of a large matrix is zeros: along x and y it is cut into bands. The product along z, which has the most
 results, comes last. It leaves out the box's columns without a site, a third of them around ellipsoids, and a large box
 is cut into slabs for it: a slab reads a few lattice planes of each level only, and its results stay in the cache.
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -28,14 +30,45 @@ _FULL_ENOUGH = 0.4
 """Boxes filled at least to this share are not split; an ellipsoid fills 0.52 of its own."""
 _SLAB = 2**16
 """Sites of a slab, at about."""
+_BAND_ROWS = 24
+"""Of a band of a matrix along x or y, at about."""
 _SNAP = 1e-9
 """Coordinates this close to a lattice plane lie on it, in cells; they need one vertex instead of two."""
 
 
+class _Banded:
+    """A constant matrix (rows, columns) whose entries other than 0 lie along a diagonal, as bands of rows."""
+
+    def __init__(self, matrix: Tensor) -> None:
+        count = max(1, round(len(matrix) / _BAND_ROWS))
+        cuts = [len(matrix) * number // count for number in range(count + 1)]
+        self._bands = [_band(matrix, top, bottom) for top, bottom in pairwise(cuts)]
+
+    def from_left(self, values: Tensor) -> Tensor:
+        """The matrix times each of values (N, columns, K)."""
+        pieces = [
+            torch.bmm(band.expand(len(values), -1, -1), values[:, first:last]) for first, last, band in self._bands
+        ]
+        return pieces[0] if len(pieces) == 1 else torch.cat(pieces, dim=1)
+
+    def from_right(self, values: Tensor) -> Tensor:
+        """Values (N, columns) times the transposed matrix."""
+        pieces = [torch.mm(values[:, first:last], band.t()) for first, last, band in self._bands]
+        return pieces[0] if len(pieces) == 1 else torch.cat(pieces, dim=1)
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Interpolation along an axis, and its transpose."""
+
+    to_sites: _Banded
+    to_lattice: _Banded
+
+
 @dataclass(frozen=True)
 class _BoxLevel:
-    matrices: tuple[Tensor | None, Tensor | None]
-    """Interpolation along x and y: (sites on the axis, lattice vertices on the axis); None: the identity."""
+    axes: tuple[_Axis | None, _Axis | None]
+    """Along x and y; None: the identity."""
     shape: tuple[int, int, int]
     """Lattice vertices along z, y, x."""
     slots: Tensor
@@ -168,9 +201,12 @@ class LatticeSites:
         """A level's features (features, lattice planes, C) on the box's columns, interpolated along x and y."""
         values = table.index_select(1, level.slots)
         if not level.in_columns:
-            along_x, along_y = level.matrices
-            values = _times_transposed(values.view(-1, level.shape[2]), along_x)
-            values = _times(along_y, values.view(-1, level.shape[1], box.width))
+            along_x, along_y = level.axes
+            if along_x is not None:
+                values = along_x.to_sites.from_right(values.view(-1, level.shape[2]))
+            values = values.view(-1, level.shape[1], box.width)
+            if along_y is not None:
+                values = along_y.to_sites.from_left(values)
             values = values.view(-1, box.height * box.width).index_select(1, box.columns)
         return values.view(self._features, level.shape[0], -1)
 
@@ -191,10 +227,12 @@ class LatticeSites:
                 if level.in_columns:
                     values = values[..., : len(box.columns)]
                 else:
-                    along_x, along_y = level.matrices
+                    along_x, along_y = level.axes
                     values = values.view(-1, len(box.columns) + 1).index_select(1, box.spread)
-                    values = _times(_transposed(along_y), values.view(-1, box.height, box.width)).view(-1, box.width)
-                    values = values if along_x is None else values @ along_x
+                    if along_y is not None:
+                        values = along_y.to_lattice.from_left(values.view(-1, box.height, box.width))
+                    values = values.view(-1, box.width)
+                    values = values if along_x is None else along_x.to_lattice.from_right(values)
                 values = values.reshape(self._features, -1)
                 for feature in range(self._features):
                     total[feature].index_add_(0, level.slots, values[feature])
@@ -238,18 +276,6 @@ class _Select(torch.autograd.Function):
         return ctx.sites.scatter_back(gradient.contiguous(), chosen), None, None, None
 
 
-def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
-    return values if matrix is None else torch.matmul(matrix, values)
-
-
-def _times_transposed(values: Tensor, matrix: Tensor | None) -> Tensor:
-    return values if matrix is None else torch.mm(values, matrix.t())
-
-
-def _transposed(matrix: Tensor | None) -> Tensor | None:
-    return None if matrix is None else matrix.t()
-
-
 def _split(coordinates: Tensor, members: Tensor) -> list[Tensor]:
     """Groups of sites whose bounding boxes are small or mostly filled; a sparse box is cut across its longest side."""
     if len(members) == 0:
@@ -266,21 +292,23 @@ def _split(coordinates: Tensor, members: Tensor) -> list[Tensor]:
 
 def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) -> tuple[_BoxLevel, Tensor | None]:
     """A level's constants, and its interpolation along z (sites, lattice planes); None: the identity."""
-    matrices, keys = [], []
+    axis_matrices, keys = [], []
     for number, coordinate in enumerate(axes):
         matrix, vertices = _axis_matrix(grid, level, coordinate)
         is_identity = matrix.shape[0] == matrix.shape[1] and torch.equal(
             matrix, torch.eye(len(matrix), dtype=matrix.dtype)
         )
-        matrices.append(None if is_identity else matrix.to(grid.table.dtype))
+        axis_matrices.append(None if is_identity else matrix.to(grid.table.dtype))
         keys.append(grid.axis_key(level, number, vertices))
     slots = keys[2][:, None] ^ (keys[1][:, None] ^ keys[0]).reshape(-1)
-    in_columns = matrices[0] is None and matrices[1] is None
+    *across, along_z = axis_matrices
+    along_x, along_y = (None if m is None else _Axis(_Banded(m), _Banded(m.t().contiguous())) for m in across)
+    in_columns = along_x is None and along_y is None
     if in_columns:
         slots = slots[:, columns]
     slots = slots.reshape(-1) + grid.first_row[level]
     shape = (len(keys[2]), len(keys[1]), len(keys[0]))
-    return _BoxLevel((matrices[0], matrices[1]), shape, slots, in_columns), matrices[2]
+    return _BoxLevel((along_x, along_y), shape, slots, in_columns), along_z
 
 
 def _slabs(depth: int, columns: int, inside: Tensor, begin: int, along_z: Sequence[Tensor | None]) -> Iterator[_Slab]:
