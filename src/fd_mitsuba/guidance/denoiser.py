@@ -37,8 +37,8 @@ class Denoiser:
             )
         if self.adds_to_base and not (self.needs_base and self.prediction_type == "sample"):
             raise UserError(
-                f"{components.folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels and prediction_type "
-                "sample; remove the entry"
+                f"{components.folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels and "
+                "prediction_type sample; remove the entry"
             )
 
     def predict_noise(
