@@ -17,11 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from fd_mitsuba.fields.axis_interpolation import AxisInterpolation, Banded, axis_matrix, band_of
 from fd_mitsuba.fields.hash_grid import HashGrid
 
 _SMALLEST_BOX = 32**3
@@ -30,44 +30,9 @@ _FULL_ENOUGH = 0.4
 """Boxes filled at least to this share are not split; an ellipsoid fills 0.52 of its own."""
 _SLAB = 2**16
 """Sites of a slab, at about."""
-_BAND_ROWS = 24
-"""Of a band of a matrix along x or y, at about."""
-_SNAP = 1e-9
-"""Coordinates this close to a lattice plane lie on it, in cells; they need one vertex instead of two."""
-
-
-class _Banded:
-    """A constant matrix (rows, columns) whose entries other than 0 lie along a diagonal, as bands of rows."""
-
-    def __init__(self, matrix: Tensor) -> None:
-        count = max(1, round(len(matrix) / _BAND_ROWS))
-        cuts = [len(matrix) * number // count for number in range(count + 1)]
-        self._bands = [_band(matrix, top, bottom) for top, bottom in pairwise(cuts)]
-
-    def from_left(self, values: Tensor) -> Tensor:
-        """The matrix times each of values (N, columns, K)."""
-        pieces = [
-            torch.bmm(band.expand(len(values), -1, -1), values[:, first:last]) for first, last, band in self._bands
-        ]
-        return pieces[0] if len(pieces) == 1 else torch.cat(pieces, dim=1)
-
-    def from_right(self, values: Tensor) -> Tensor:
-        """Values (N, columns) times the transposed matrix."""
-        pieces = [torch.mm(values[:, first:last], band.t()) for first, last, band in self._bands]
-        return pieces[0] if len(pieces) == 1 else torch.cat(pieces, dim=1)
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Interpolation along an axis, and its transpose."""
-
-    to_sites: _Banded
-    to_lattice: _Banded
-
-
 @dataclass(frozen=True)
 class _BoxLevel:
-    axes: tuple[_Axis | None, _Axis | None]
+    axes: tuple[AxisInterpolation | None, AxisInterpolation | None]
     """Along x and y; None: the identity."""
     shape: tuple[int, int, int]
     """Lattice vertices along z, y, x."""
@@ -294,7 +259,7 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) 
     """A level's constants, and its interpolation along z (sites, lattice planes); None: the identity."""
     axis_matrices, keys = [], []
     for number, coordinate in enumerate(axes):
-        matrix, vertices = _axis_matrix(grid, level, coordinate)
+        matrix, vertices = axis_matrix(grid, level, coordinate)
         is_identity = matrix.shape[0] == matrix.shape[1] and torch.equal(
             matrix, torch.eye(len(matrix), dtype=matrix.dtype)
         )
@@ -302,7 +267,7 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) 
         keys.append(grid.axis_key(level, number, vertices))
     slots = keys[2][:, None] ^ (keys[1][:, None] ^ keys[0]).reshape(-1)
     *across, along_z = axis_matrices
-    along_x, along_y = (None if m is None else _Axis(_Banded(m), _Banded(m.t().contiguous())) for m in across)
+    along_x, along_y = (None if m is None else AxisInterpolation(Banded(m), Banded(m.t().contiguous())) for m in across)
     in_columns = along_x is None and along_y is None
     if in_columns:
         slots = slots[:, columns]
@@ -317,30 +282,5 @@ def _slabs(depth: int, columns: int, inside: Tensor, begin: int, along_z: Sequen
     for top in range(0, depth, planes):
         bottom = min(top + planes, depth)
         first, last = torch.searchsorted(inside, torch.tensor([top * columns, bottom * columns])).tolist()
-        levels = tuple(_band(matrix, top, bottom) for matrix in along_z)
+        levels = tuple(band_of(matrix, top, bottom) for matrix in along_z)
         yield _Slab(bottom - top, inside[first:last] - top * columns, begin + first, begin + last, levels)
-
-
-def _band(matrix: Tensor | None, top: int, bottom: int) -> tuple[int, int, Tensor | None]:
-    """The columns of these rows that are not all 0, as first, one after the last, and what is between."""
-    if matrix is None:
-        return top, bottom, None
-    used = (matrix[top:bottom] != 0).any(dim=0).nonzero()[:, 0]
-    first, last = int(used[0]), int(used[-1]) + 1
-    return first, last, matrix[top:bottom, first:last].contiguous()
-
-
-def _axis_matrix(grid: HashGrid, level: int, coordinate: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear interpolation as a matrix (sites, vertices) and the lattice vertices (int64) that it reads."""
-    resolution = grid.resolutions[level]
-    cell, fraction = grid.split(level, coordinate.double())
-    at_upper = fraction > 1 - _SNAP
-    cell, fraction = cell + at_upper.long(), torch.where(at_upper | (fraction < _SNAP), 0.0, fraction)
-    upper = (cell + 1).clamp(max=resolution)
-    vertices = torch.cat([cell, upper[fraction > 0]]).unique()
-    matrix = torch.zeros(len(coordinate), len(vertices), dtype=torch.float64)
-    sites = torch.arange(len(coordinate))
-    matrix.index_put_((sites, torch.searchsorted(vertices, cell)), 1 - fraction)
-    reads = fraction > 0
-    matrix.index_put_((sites[reads], torch.searchsorted(vertices, upper[reads])), fraction[reads])
-    return matrix, vertices

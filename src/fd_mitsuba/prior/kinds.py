@@ -53,7 +53,6 @@ class Kind:
         masked_noise: share of the pictures with noise on the part alone, as guidance with `mask_guidance` makes them.
         prediction: what the UNet says of a noisy picture, as Diffusers names it: `v_prediction`, or `sample`, the clean
             one, which is the easiest to learn where most of it is a copy of the condition.
-        difference: whether the UNet says only what must be added to the condition.
         build_vae: the autoencoder that goes into the folder.
         conventions: written as `fd_mitsuba.json` beside `model_index.json`.
     """
@@ -73,9 +72,13 @@ class Kind:
     small_steps: int
     masked_noise: float
     prediction: str
-    difference: bool
     build_vae: Callable[[], AutoencoderTiny]
     conventions: dict[str, Any]
+
+    @property
+    def difference(self) -> bool:
+        """Whether the UNet says only what must be added to the condition."""
+        return self.conventions.get("predicts") == "difference"
 
     def build_modules(self, tokenizer: PreTrainedTokenizerFast) -> torch.nn.ModuleDict:
         """Fresh `text_encoder` and `unet`."""
@@ -105,7 +108,6 @@ GEOMETRY = Kind(
     small_steps=1000,
     masked_noise=0.0,
     prediction="sample",
-    difference=True,
     build_vae=build_vae,
     conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference"},
 )
@@ -125,7 +127,6 @@ APPEARANCE = Kind(
     small_steps=3500,
     masked_noise=0.9,
     prediction="sample",
-    difference=False,
     build_vae=build_colour_vae,
     conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
 )
