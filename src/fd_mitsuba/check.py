@@ -57,6 +57,9 @@ class CheckReport:
     prompt: str
     base: tuple[BaseCheck, ...]
     base_closed: bool
+    base_low: tuple[float, ...]
+    base_high: tuple[float, ...]
+    """Corners of the base's bounding box in the user's units."""
     longest_side: float
     """Longest side of the base's bounding box in the user's units."""
     grid_cell: float
@@ -81,8 +84,8 @@ class CheckReport:
             pieces = f"{found.components} component{'s' if found.components != 1 else ''}"
             lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
         lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
-        spans = zip("xyz", self.grid_low, self.grid_high, strict=True)
-        lines.append(f"grid     {', '.join(f'{axis} {low:.4g} to {high:.4g}' for axis, low, high in spans)}")
+        lines.append(f"         base {_box(self.base_low, self.base_high)}")
+        lines.append(f"         grid {_box(self.grid_low, self.grid_high)}")
         for region in self.regions:
             touch = "touches the base" if region.gap_to_base == 0 else f"{region.gap_to_base:.3g} from the base"
             lines.append(
@@ -119,6 +122,8 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         prompt=scene.prompt,
         base=base,
         base_closed=all(mesh.topology.closed for mesh in base),
+        base_low=tuple(used.min(axis=0).tolist()),
+        base_high=tuple(used.max(axis=0).tolist()),
         longest_side=float(np.ptp(used, axis=0).max()),
         grid_cell=cell / scene.frame.scale,
         grid_low=_user_corner(scene, -GRID_HALF_EXTENT),
@@ -127,6 +132,10 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         cost=cost,
         warnings=tuple(_base_warnings(base) + _region_warnings(regions, config) + _scene_warnings(scene, config)),
     )
+
+
+def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
+    return ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
 
 
 def _user_corner(scene: EditScene, value: float) -> tuple[float, ...]:

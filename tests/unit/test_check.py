@@ -50,7 +50,7 @@ def test_a_region_with_a_flat_cap_is_told(make_scene: Make) -> None:
     assert "outside the grid" not in warnings(make_scene(region=ball("0.15", 0, high - 0.15 * 1.01, 0)))
 
 
-def test_report_as_json_and_lines(make_scene: Make) -> None:
+def test_report_as_json_and_lines(make_scene: Make, animal: tuple[np.ndarray, np.ndarray]) -> None:
     report = check_scene(load_edit_scene(make_scene()), RunConfig())
     data = json.loads(json.dumps(report.to_json()))
     assert data["base"][0]["topology"]["closed"] is True and data["regions"][0]["name"] == "wing"
@@ -58,7 +58,10 @@ def test_report_as_json_and_lines(make_scene: Make) -> None:
     # A cube in the scene's units, 7/6 of the longest side of the base, around the base's centre.
     low, high = np.array(data["grid_low"]), np.array(data["grid_high"])
     assert high - low == pytest.approx([report.longest_side * 7 / 6] * 3, rel=1e-5)
-    assert any(line.startswith("grid ") and f"x {low[0]:.4g} to {high[0]:.4g}" in line for line in report.lines())
+    assert any(f"grid x {low[0]:.4g} to {high[0]:.4g}" in line for line in report.lines())
+    base = animal[0].min(axis=0), animal[0].max(axis=0)
+    assert np.array([data["base_low"], data["base_high"]]) == pytest.approx(np.stack(base), abs=1e-5)
+    assert any(f"base x {base[0][0]:.4g} to {base[1][0]:.4g}" in line for line in report.lines())
     assert all(isinstance(line, str) and "\n" not in line for line in report.lines())
 
 
