@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import BASE, INTEGRATOR, LIGHT, REGION, write_ply
 
 from fd_mitsuba.errors import UserError
@@ -138,6 +139,16 @@ def message_of(path: Path, parameters: dict[str, str] | None = None) -> str:
     assert "\n" not in message and "Traceback" not in message and ".cpp" not in message and "\x1b" not in message
     assert str(path) in message and len(message) < 500
     return message
+
+
+@pytest.mark.parametrize(("plugin", "suffix"), [("stl", "stl"), ("obj", "glb"), ("ply", "off")])
+def test_a_mesh_in_a_format_that_mitsuba_does_not_read(
+    make_scene: Make, tmp_path: Path, plugin: str, suffix: str
+) -> None:
+    trimesh.creation.icosphere().export(tmp_path / f"ball.{suffix}")
+    message = message_of(make_scene(base=BASE.replace('"ply"', f'"{plugin}"').replace("animal.ply", f"ball.{suffix}")))
+    for word in ("body", f"ball.{suffix}", "PLY, OBJ", "convert", "'ball.ply'"):
+        assert word in message, message
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -24,6 +24,8 @@ from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
+FOREIGN_MESHES = frozenset(".stl .glb .gltf .fbx .dae .off .3ds .blend .usd .usda .usdc .usdz .abc".split())
+"""Suffixes of meshes that people have and Mitsuba does not read; of some its OBJ reader makes an empty mesh."""
 LEAST_SHARE_IN_GRID = 0.5
 """A region with less of its volume than this in the grid cube is an error; a smaller overhang is a warning."""
 
@@ -211,6 +213,12 @@ def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> 
 
 def _base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:
     filename = element.properties.get("filename")
+    if filename and Path(filename).suffix.lower() in FOREIGN_MESHES:
+        name, saved = Path(filename).name, Path(filename).with_suffix(".ply").name
+        raise element.error(
+            f"{filename}: Mitsuba reads PLY, OBJ and serialized meshes; convert it, in Blender or by "
+            f"trimesh.load({name!r}, force='mesh').export({saved!r})"
+        )
     vertices, faces = _triangles(file, element, filename)
     sources = (file.resolve(filename),) if filename else ()
     return TriangleMesh(element.id or BASE_NAME, vertices, faces, sources)
