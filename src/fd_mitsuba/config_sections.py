@@ -59,6 +59,8 @@ class GeometryConfig(Section):
     """Weight of the loss that leaves no focal region without a part; not in the paper."""
     presence_share: Annotated[float, Field(gt=0, le=1)] = 0.02
     """Share of each region, outside the base, that it keeps filled."""
+    lambda_tether: NonNegative = 0.0
+    """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
     views: Count = 4
     spp: Count = 4
     silhouette_spp: Count = 1

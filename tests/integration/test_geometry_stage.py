@@ -12,6 +12,7 @@ import torch
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
+from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage, StepRecord
@@ -107,6 +108,25 @@ def test_the_presence_loss_leaves_no_region_empty(stage: Callable[..., GeometryS
     inside = shrinker.extractor.part_sdf(shrinker.field) > 0
     room = shrinker.room[:, shrinker.extractor.active_index]
     assert all(0 < float(inside[row].float().mean()) < 0.5 for row in room)
+
+
+def test_the_tether_loss_hangs_a_loose_piece_on_the_base(stage: Callable[..., GeometryStage]) -> None:
+    """A ball above the animal's back, in its region but apart from it, and no loss that would move it but this one."""
+
+    def pieces(weight: float) -> int:
+        tied = stage(1.0, lambda_sds=0.0, lambda_focal=0.0, lambda_tether=weight, grid_resolution=40)
+        grid, room = tied.grid, tied.region_sdf > 0
+        high = grid.vertices[room & (tied.sdf_base < -3 * grid.spacing)]
+        centre = high[high[:, 1].argmax()] - torch.tensor([0.0, 1.5 * grid.spacing, 0.0])
+        tied.extractor.initial_sdf = 1.2 * grid.spacing - (grid.vertices - centre).norm(dim=1)
+        for step in range(60):
+            tied.step(step)
+        sdf = torch.full((grid.count,), -1.0)
+        sdf[tied.extractor.active_index] = tied.extractor.part_sdf(tied.field)
+        solid = (torch.maximum(sdf, tied.sdf_base) > 0).view((grid.side,) * 3)
+        return label_pieces(solid.numpy())[1]
+
+    assert (pieces(0.0), pieces(100.0)) == (2, 1)
 
 
 def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., GeometryStage], tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.extraction.tet_grid import TetGrid
 
 ISLAND_SHARE = 0.01
@@ -113,11 +114,8 @@ def _joined(piece: np.ndarray, sdf_base: Tensor) -> bool:
 
 
 def _label(grid: TetGrid, marked: Tensor) -> tuple[np.ndarray, int]:
-    """The number (z, y, x) of each marked vertex's piece, from 1 on, and how many there are."""
-    along = np.zeros((3, 3, 3), dtype=bool)
-    along[1:, 1:, 1:] = True
-    structure = along | along[::-1, ::-1, ::-1]
-    return ndimage.label(marked.view((grid.side,) * 3).numpy(), structure)
+    """As `label_pieces`, of marks (count,)."""
+    return label_pieces(marked.view((grid.side,) * 3).numpy())
 
 
 def _part_shares(grid: TetGrid, label: np.ndarray, count: int, sdf_part: Tensor, owner: Tensor) -> np.ndarray:

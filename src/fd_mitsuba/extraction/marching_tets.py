@@ -54,9 +54,7 @@ def edge_ends(edges: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tenso
     return lower, lower + steps.index_select(0, edges & (EDGE_SLOTS - 1))
 
 
-def crossing_faces(
-    inside: Tensor, cells: Tensor | None = None, lookup: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def crossing_faces(inside: Tensor, cells: Tensor | None = None, lookup: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The crossed edges and the faces between them, looking only at cells that have both signs.
 
     A cell's eight signs select its triangles from a table of 256 cases.

@@ -30,6 +30,8 @@ _FULL_ENOUGH = 0.4
 """Boxes filled at least to this share are not split; an ellipsoid fills 0.52 of its own."""
 _SLAB = 2**16
 """Sites of a slab, at about."""
+
+
 @dataclass(frozen=True)
 class _BoxLevel:
     axes: tuple[AxisInterpolation | None, AxisInterpolation | None]

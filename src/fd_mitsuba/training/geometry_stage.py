@@ -1,7 +1,7 @@
 """One step of the geometry stage: field -> surface -> pictures -> guidance and losses -> optimiser.
 
 L_geo = lambda_sds L_SDS + lambda_focal L_GF + lambda_collision L_CA (paper, supplement "Geometry Learning"), and an
-optional price on the part's volume. A weight of 0 turns its work off.
+optional price on the part's volume, on empty regions and on loose pieces. A weight of 0 turns its work off.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
 from fd_mitsuba.losses.collision import loss_collision
 from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.losses.presence import loss_presence
+from fd_mitsuba.losses.tether import loss_tether
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
@@ -31,6 +32,7 @@ from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.sheets import geometry_sheet
 from fd_mitsuba.training.step_views import check_views, step_views
+from fd_mitsuba.training.tethers import Tethers
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
@@ -89,6 +91,8 @@ class GeometryStage:
         self.room = self._room(regions > 0)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
+        room = self.region_sdf > -geometry.focal_band
+        self.tethers = Tethers(self.grid, self.sdf_base, room, self.extractor.active_index)
         self.base_surface = self._base_surface()
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, geometry)
@@ -150,7 +154,8 @@ class GeometryStage:
         phase, phase_step, phase_length = self.phase_of(step)
         cameras, closeup = self.cameras(step)
         samples = self._samples(step)
-        surface = self.extractor(self.field, samples)
+        tethers = self._tethers()
+        surface = self.extractor(self.field, samples if samples is None else torch.cat([samples, tethers]))
         losses: dict[str, Tensor] = {}
         values: dict[str, float] = {}
         pictures, preview = torch.zeros(0), None
@@ -164,7 +169,9 @@ class GeometryStage:
             values.update(result.logs)
             self._watch_visibility(pictures)
         if samples is not None:
-            losses.update(self._sample_losses(surface.sample_sdf, samples))
+            losses.update(self._sample_losses(surface.sample_sdf[: len(samples)], samples))
+            if geometry.lambda_tether > 0:
+                losses["tether"] = loss_tether(surface.sample_sdf[len(samples) :], self.grid.spacing)
         weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
@@ -215,14 +222,20 @@ class GeometryStage:
 
     def _samples(self, step: int) -> Tensor | None:
         geometry = self.config.geometry
-        weights = (geometry.lambda_focal, self.lambda_collision, geometry.lambda_volume, geometry.lambda_presence)
-        if not any(weights):
+        additions = (geometry.lambda_volume, geometry.lambda_presence, geometry.lambda_tether)
+        if not any((geometry.lambda_focal, self.lambda_collision, *additions)):
             return None
         index = self.extractor.active_index
         if len(index) <= geometry.focal_samples:
             return index
         generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.SAMPLES, step))
         return index[torch.randint(len(index), (geometry.focal_samples,), generator=generator)]
+
+    def _tethers(self) -> Tensor:
+        """Vertices (T,) between the object and pieces of the part that have come loose; none without their loss."""
+        if self.config.geometry.lambda_tether == 0 or self.scene.subtracts:
+            return self.active[:0]
+        return self.tethers.find(self.extractor.part_sdf(self.field))
 
     def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
         return self._pass(self._passes, phase).render(
