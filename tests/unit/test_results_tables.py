@@ -53,6 +53,8 @@ def filled(tmp_path: Path) -> str:
     runs = [run("cat", seed, tmp_path / f"cat{seed}") for seed in range(3)]
     runs.append(run("mug", 0, tmp_path / "mug0", rank=2, leakage=0.02))
     runs.append(run("mug", 1, tmp_path / "mug1", drift=0.01))
+    for one, excess in zip(runs, (None, -0.1, 0.4, 0.6), strict=False):
+        one["multi_face"] = {"excess": excess}
     states = ["finished"] * 4 + ["skipped", "failed"]
     (tmp_path / "runs" / "evaluate").mkdir(parents=True)
     (tmp_path / "runs" / "evaluate.json").write_text(json.dumps({"runs": runs}))
@@ -97,6 +99,7 @@ def test_bars_and_tables_follow_from_the_runs(filled: str, tmp_path: Path) -> No
     assert bars["... and for the start in ≤ 25 %"] == ["0 of 5 (0%)", "yes"]
     assert bars["base preserved perfectly in all"] == ["4 of 6 (67%)", "**no**"]
     assert bars["leakage ≤ 1 % in all"] == ["4 of 6 (67%)", "**no**"]
+    assert bars["most back views taken for the front in ≤ 5 % of the runs"] == ["1 of 5 (20%)", "**no**"]
     assert bars["without L_GF leakage grows ≥ 5 times"] == ["1.00% → 4.00%, 4.0 times", "**no**"]
     assert bars["without L_CA overlap grows ≥ 3 times"] == ["2.00% → 8.00%, 4.0 times", "yes"]
     assert bars["without L_GF leakage grows ≥ 5 times, the paper's losses alone"] == ["0.00% → 0.10%", "yes"]
