@@ -29,11 +29,11 @@ from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
 
 KIND = "evaluator"
 DATA = Path("runs") / "clip_data" / "training"
-SHARDS, SEEDS_A_SHARD = 80, 8
+SHARDS, SEEDS_A_SHARD = 240, 8
 GROUP = 6
 """Pictures of a batch that are taken from one body."""
 KEPT_PATCHES = 28
-ALL_PATCHES_FROM = 0.65
+ALL_PATCHES_FROM = 0.8
 """From this share of the training on, every patch is seen, as in use."""
 LEARNING_RATE = 1.2e-3
 
@@ -135,7 +135,7 @@ def train_evaluator(
     folder: Path,
     seconds: float,
     *,
-    total_steps: int = 4000,
+    total_steps: int = 12000,
     batch_size: int = 64,
     seed: int = 0,
     data: Path = DATA,
