@@ -148,6 +148,12 @@ def test_front_in_back_counts_back_views_that_look_like_the_front() -> None:
     assert found.excess == pytest.approx(0.6)
     hat = base + torch.tensor([0.6, 0.0, 2.0])  # the same in every view, and by chance nearer to the base's front
     assert front_in_back(hat, base, azimuth).excess == 0
+    # A vase: almost the same from all sides, so that what a flower on it leans to says nothing.
+    vase = torch.stack([0.02 * torch.cos(angle), 0.02 * torch.sin(angle), torch.ones_like(angle)], dim=1)
+    found = front_in_back(vase, vase, azimuth)
+    assert found.confusion == 0 and found.excess is None
+    mean = np.cos(np.radians([0, 18, 36])) @ [1, 2, 2] / 5 * 0.02  # of the front's five views, and minus that behind
+    assert found.separation == pytest.approx(2 * mean / np.hypot(1, mean), rel=1e-3)
     blind = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert front_in_back(blind, blind, azimuth).excess is None
     assert front_in_back(base[:3], base[:3], azimuth[:3]) is None

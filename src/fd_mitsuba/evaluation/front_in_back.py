@@ -13,6 +13,9 @@ from fd_mitsuba.scene.views import view_label
 
 MOST_CONFUSION = 0.25
 """A judge that errs more often than this about the base itself cannot say anything about the edit."""
+LEAST_SEPARATION = 0.1
+"""A base whose front and back differ by less in unit features, such as a vase, has no front that a part could double.
+The shipped animals have 0.4 to 0.9, a mug and a snowman 0.25, the vase 0.05 (built-in evaluator, normals)."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +24,15 @@ class FrontInBack:
     share: of the edited object's back views, those that lean to the front.
     base_share: the same of the base's own back views, each left out of the mean that it is compared with.
     confusion: share of the base's front and back views, left out likewise, that the judge takes for the other side.
-    excess: `share - base_share`, the score; None where the confusion exceeds `MOST_CONFUSION`.
+    separation: distance between the mean features of the base's front and back, as unit vectors.
+    excess: `share - base_share`, the score; None where the confusion exceeds `MOST_CONFUSION`, or the separation is
+        below `LEAST_SEPARATION`.
     """
 
     share: float
     base_share: float
     confusion: float
+    separation: float
     excess: float | None
 
 
@@ -54,7 +60,9 @@ def front_in_back(edited: Tensor, base: Tensor, azimuth_deg: np.ndarray) -> Fron
     base_share = float(torch.cat(as_front).double().mean())
     confusion = float(torch.cat(as_front + as_back).double().mean())
     share = float(mistaken.double().mean())
-    return FrontInBack(share, base_share, confusion, share - base_share if confusion <= MOST_CONFUSION else None)
+    separation = float((unit(base[front].mean(0)) - unit(base[back].mean(0))).norm())
+    tells = confusion <= MOST_CONFUSION and separation >= LEAST_SEPARATION
+    return FrontInBack(share, base_share, confusion, separation, share - base_share if tells else None)
 
 
 def _leans_to_front(rows: Tensor, base: tuple[Tensor, Tensor], own: tuple[Tensor, Tensor] | None = None) -> Tensor:
