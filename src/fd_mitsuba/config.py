@@ -25,6 +25,8 @@ from fd_mitsuba.errors import UserError
 
 _WITHOUT_EFFECT = {"guidance": ("device",)}
 """Settings that change where the work is done and not what comes out."""
+_NEWER = {"geometry": {"lambda_tether": 0.0}}
+"""Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
 
 class RunConfig(Section):
@@ -60,6 +62,10 @@ class RunConfig(Section):
         for section, names in _WITHOUT_EFFECT.items():
             for name in names:
                 del values[section][name]
+        for section, neutral in _NEWER.items():
+            for name, value in neutral.items():
+                if values[section][name] == value:
+                    del values[section][name]
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
@@ -205,3 +207,13 @@ def test_hash_follows_every_setting() -> None:
     assert len({RunConfig().content_hash(), *hashes}) == len(overrides) + 1
     assert load_config(None, ["geometry.steps=3000"]).content_hash() == RunConfig().content_hash()
     assert RunConfig.model_validate(RunConfig().model_dump(mode="json")).content_hash() == RunConfig().content_hash()
+
+
+def test_runs_from_before_a_setting_was_there_can_be_read() -> None:
+    """Their settings lack it, and so does what was hashed: the same hash now, another one where it does something."""
+    before = RunConfig().model_dump(mode="json", exclude={"texture", "appearance"})
+    del before["geometry"]["lambda_tether"], before["guidance"]["device"]
+    known = hashlib.sha256(json.dumps(before, sort_keys=True).encode()).hexdigest()[:16]
+    read = RunConfig.model_validate(before)
+    assert read.geometry.lambda_tether == 0 and read.content_hash() == RunConfig().content_hash() == known
+    assert load_config(None, ["geometry.lambda_tether=1"]).content_hash() != known
