@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from fd_mitsuba.config import FieldConfig
-from fd_mitsuba.extraction.surface import SurfaceExtractor, active_vertices
+from fd_mitsuba.extraction.active_vertices import active_vertices
+from fd_mitsuba.extraction.surface import SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.render.geometry_pass import GeometryPass

@@ -19,7 +19,8 @@ from fd_mitsuba.export.part_pieces import BRIDGE_REACH
 from fd_mitsuba.export.part_record import anchor
 from fd_mitsuba.export.part_solid import SINK_CELLS, fillet_reach, part_solid
 from fd_mitsuba.export.solid import Solid
-from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor, active_vertices
+from fd_mitsuba.extraction.active_vertices import active_vertices
+from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf

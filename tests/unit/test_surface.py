@@ -8,8 +8,9 @@ import torch
 import trimesh
 
 from fd_mitsuba.config import FieldConfig
+from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.marching_tets import crossing_faces, edge_ends
-from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface, active_vertices
+from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.part_sdf import PartField
 

@@ -7,10 +7,10 @@ from scipy import ndimage
 
 _UPWARDS = np.zeros((3, 3, 3), dtype=bool)
 _UPWARDS[1:, 1:, 1:] = True
-NEIGHBOURS = _UPWARDS | _UPWARDS[::-1, ::-1, ::-1]
+_NEIGHBOURS = _UPWARDS | _UPWARDS[::-1, ::-1, ::-1]
 """The vertices (z, y, x) that an edge joins to the middle one, and itself."""
 
 
 def label_pieces(marked: np.ndarray) -> tuple[np.ndarray, int]:
     """The number (z, y, x) of each marked vertex's piece, from 1 on, and how many there are; 0 where not marked."""
-    return ndimage.label(marked, NEIGHBOURS)
+    return ndimage.label(marked, _NEIGHBOURS)

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.part_sdf import PartField
 
@@ -31,7 +31,7 @@ class SubtractionExtractor(SurfaceExtractor):
     def __init__(self, grid: TetGrid, sdf_base: Tensor, *others: Any, **named: Any) -> None:
         super().__init__(grid, -sdf_base, *others, **named)
 
-    def __call__(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+    def __call__(self, field: PartField, samples: Samples | None = None) -> UnionSurface:
         """The remaining base's surface, counter-clockwise seen from outside; see `SurfaceExtractor.__call__`."""
         return _turned(super().__call__(field, samples))
 

@@ -13,6 +13,7 @@ Only *active* vertices of the grid, those near the focal regions, know the part;
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -35,10 +36,9 @@ from fd_mitsuba.fields.union import soft_union
 FAR_OUTSIDE = -10.0
 """`sdf_part` where it is not evaluated: below any base sdf by more than any fillet, so that the union is the base."""
 
-DEFAULT_MARGIN = 0.15
-"""How far beyond the focal regions the part may reach at most, canonical units: three of the focal loss' free bands."""
-
 _OFFSET_CELLS = 0.5
+
+Samples = Tensor | Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -59,20 +59,6 @@ class UnionSurface:
     part_weight: Tensor
     face_is_part: Tensor
     sample_sdf: Tensor
-
-
-def active_vertices(grid: TetGrid, region_sdf: Tensor, margin: float = DEFAULT_MARGIN) -> Tensor:
-    """The vertices (A,) int64, ascending, that the part may reach: inside a region or closer to one than `margin`.
-
-    Args:
-        grid: the grid.
-        region_sdf: (count,) signed distance to the focal regions, inside positive, the largest over the regions.
-        margin: canonical units.
-
-    The grid's border is left out, so that every surface is closed within the grid.
-    """
-    index = (region_sdf > -margin).nonzero()[:, 0]
-    return index[~grid.is_border(index)]
 
 
 class SurfaceExtractor:
@@ -125,14 +111,17 @@ class SurfaceExtractor:
         self._sites: LatticeSites | None = None
         self._prepare_static()
 
-    def __call__(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+    def __call__(self, field: PartField, samples: Samples | None = None) -> UnionSurface:
         """The union's surface for the field's present parameters.
 
         Args:
             field: the part; all calls must use the same hash grid layout.
-            samples: (S,) active vertices, in any order, repeats allowed, at which `sample_sdf` is wanted.
+            samples: (S,) active vertices, in any order, repeats allowed, at which `sample_sdf` is wanted; or a function
+                that chooses them by the part's sdf (A,) at `active_index`, as `part_sdf` gives it.
         """
         sites, features, sdf_part = self._part_at_sites(field)
+        if callable(samples):
+            samples = samples(self._at_active(sdf_part))
         union = soft_union(self._site_base, sdf_part, self.union_k, self.union_only_outside)
         edges, faces = self._crossings(union > 0)
         lower, upper = edge_ends(edges, self._box.shape)
@@ -200,8 +189,10 @@ class SurfaceExtractor:
     @torch.no_grad()
     def part_sdf(self, field: PartField) -> Tensor:
         """`sdf_part` (A,) at `active_index`, without gradients."""
-        sites, _, sdf_part = self._part_at_sites(field)
-        return sdf_part[self._box_site[self._box.local(self.active_index)].long()]
+        return self._at_active(self._part_at_sites(field)[2])
+
+    def _at_active(self, sdf_at_sites: Tensor) -> Tensor:
+        return sdf_at_sites[self._box_site[self._box.local(self.active_index)].long()]
 
     def _prepare_static(self) -> None:
         """What the base contributes whatever the part does: edges without, and cells without, an active end."""

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
-from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface, active_vertices
+from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.part_sdf import PartField
@@ -91,8 +92,10 @@ class GeometryStage:
         self.room = self._room(regions > 0)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
-        room = self.region_sdf > -geometry.focal_band
-        self.tethers = Tethers(self.grid, self.sdf_base, room, self.extractor.active_index)
+        self.tethers: Tethers | None = None
+        if geometry.lambda_tether > 0 and not scene.subtracts:
+            room = self.region_sdf > -geometry.focal_band
+            self.tethers = Tethers(self.grid, self.sdf_base, room, self.extractor.active_index)
         self.base_surface = self._base_surface()
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, geometry)
@@ -154,8 +157,7 @@ class GeometryStage:
         phase, phase_step, phase_length = self.phase_of(step)
         cameras, closeup = self.cameras(step)
         samples = self._samples(step)
-        tethers = self._tethers()
-        surface = self.extractor(self.field, samples if samples is None else torch.cat([samples, tethers]))
+        surface = self.extractor(self.field, self._with_tethers(samples))
         losses: dict[str, Tensor] = {}
         values: dict[str, float] = {}
         pictures, preview = torch.zeros(0), None
@@ -170,7 +172,7 @@ class GeometryStage:
             self._watch_visibility(pictures)
         if samples is not None:
             losses.update(self._sample_losses(surface.sample_sdf[: len(samples)], samples))
-            if geometry.lambda_tether > 0:
+            if self.tethers is not None:
                 losses["tether"] = loss_tether(surface.sample_sdf[len(samples) :], self.grid.spacing)
         weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
@@ -222,7 +224,7 @@ class GeometryStage:
 
     def _samples(self, step: int) -> Tensor | None:
         geometry = self.config.geometry
-        additions = (geometry.lambda_volume, geometry.lambda_presence, geometry.lambda_tether)
+        additions = (geometry.lambda_volume, geometry.lambda_presence, self.tethers is not None)
         if not any((geometry.lambda_focal, self.lambda_collision, *additions)):
             return None
         index = self.extractor.active_index
@@ -231,11 +233,12 @@ class GeometryStage:
         generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.SAMPLES, step))
         return index[torch.randint(len(index), (geometry.focal_samples,), generator=generator)]
 
-    def _tethers(self) -> Tensor:
-        """Vertices (T,) between the object and pieces of the part that have come loose; none without their loss."""
-        if self.config.geometry.lambda_tether == 0 or self.scene.subtracts:
-            return self.active[:0]
-        return self.tethers.find(self.extractor.part_sdf(self.field))
+    def _with_tethers(self, samples: Tensor | None) -> Samples | None:
+        """The samples, and after them the vertices between the object and loose pieces where their loss counts."""
+        tethers = self.tethers
+        if samples is None or tethers is None:
+            return samples
+        return lambda sdf_part: torch.cat([samples, tethers.find(sdf_part)])
 
     def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
         return self._pass(self._passes, phase).render(

@@ -57,14 +57,13 @@ def tether_vertices(part: np.ndarray, base: np.ndarray, room: np.ndarray) -> np.
         part, base: (z, y, x) bool, what is inside of either.
         room: (z, y, x) bool, where the part may grow.
     """
-    nothing = np.zeros(0, dtype=np.int64)
     label, count = label_pieces(part | base)
     held = np.zeros(count + 1, dtype=bool)
     held[label[base]] = True
     sizes = np.bincount(label[part], minlength=count + 1)
     loose = np.flatnonzero(~held & (sizes >= max(1.0, LEAST_SHARE * part.sum())))
     if not len(loose) or not held.any():
-        return nothing
+        return np.zeros(0, dtype=np.int64)
     distance, nearest = ndimage.distance_transform_edt(~held[label], return_indices=True)
     marked = np.zeros(part.shape, dtype=bool)
     for number in loose:
