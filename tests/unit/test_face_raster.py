@@ -36,7 +36,9 @@ def loose(count: int, spread: float, length: float) -> Arrays:
     return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count).reshape(-1, 3)
 
 
-def compare(vertices: np.ndarray, faces: np.ndarray, static_faces: int, radius: float = 3.0) -> tuple[float, Hit, Hit]:
+def compare(
+    vertices: np.ndarray, faces: np.ndarray, static_faces: int, radius: float = 3.0, from_outside: bool = False
+) -> tuple[float, Hit, Hit]:
     """The share of film points at which both ways agree about the face or its depth, and both hits."""
     cameras = FilmCameras(CameraBatch.around(np.array([0.0, 70.0, 200.0]), 20.0, radius, 45.0), SIZE)
     numbers = np.random.default_rng(1)
@@ -45,7 +47,7 @@ def compare(vertices: np.ndarray, faces: np.ndarray, static_faces: int, radius: 
     points, view = mi.Point2f(*(upload_floats(row) for row in film)), upload_indices(np.arange(3).repeat(PER_VIEW))
     tracer = MeshTracer()
     tracer.set_mesh(vertices, faces, static_faces)
-    seen = tracer.draw(cameras, points, view, (upload_floats(vertices), upload_indices(faces)))
+    seen = tracer.draw(cameras, points, view, (upload_floats(vertices), upload_indices(faces)), from_outside)
     traced = tracer.trace(cameras.at(view).ray(points), coherent=False)
     both = np.array(seen.seen) & np.array(traced.seen)
     with np.errstate(invalid="ignore"):
@@ -75,6 +77,13 @@ def test_the_same_as_the_ray_tracer(mesh: Arrays, static_faces: int, radius: flo
     agreement, seen, traced = compare(*mesh, static_faces, radius)
     assert agreement >= 0.999
     assert np.array(traced.seen).sum() > 0.02 * 3 * PER_VIEW or mesh[0].std() < 0.2
+
+
+@pytest.mark.parametrize(("mesh", "static_faces", "radius"), [(balls(4), 0, 3.0), (balls(5), 0, 1.2)])
+def test_the_backs_of_closed_meshes_need_not_be_drawn(mesh: Arrays, static_faces: int, radius: float) -> None:
+    assert compare(*mesh, static_faces, radius, from_outside=True)[0] >= 0.999
+    inside_out = mesh[0], mesh[1][:, ::-1]
+    assert compare(*inside_out, static_faces, radius, from_outside=True)[0] < 0.9  # backs are indeed left out
 
 
 def test_nothing_is_seen_of_what_lies_behind_every_camera() -> None:

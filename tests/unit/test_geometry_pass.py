@@ -13,8 +13,12 @@ from fd_mitsuba import mitsuba_api
 
 mi = mitsuba_api.start()
 
+from fd_mitsuba.render.cameras import FilmCameras  # noqa: E402
+from fd_mitsuba.render.enclosing import is_closed, is_outside  # noqa: E402
 from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
-from fd_mitsuba.render.mesh_edges import EdgeCache, corners, pair_half_edges  # noqa: E402
+from fd_mitsuba.render.mesh_edges import corners, pair_closed, pair_half_edges  # noqa: E402
+from fd_mitsuba.render.silhouette import find_outline  # noqa: E402
+from fd_mitsuba.render.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 Mesh = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -230,34 +234,53 @@ def test_edges_of_closed_and_open_meshes() -> None:
         assert (np.sort(np.stack([start, end, opposite], 1)) == np.sort(faces[edges.half_a // 3])).all()
 
 
-def test_only_edges_of_closed_and_oriented_meshes_count_as_such() -> None:
+def test_closed_means_that_every_edge_is_run_along_both_ways() -> None:
     faces = ball(2)[1].numpy()
     turned = np.concatenate([faces[:1, ::-1], faces[1:]])
-    assert pair_half_edges(faces).is_oriented
-    for other in (turned, faces[1:], np.concatenate([faces, faces]), np.concatenate([faces, faces[:, ::-1]])):
-        assert not pair_half_edges(other).is_oriented
-    # With indices too large for the quick way, the slow one must find the same edges in the same order.
-    quick, slow = pair_half_edges(faces), pair_half_edges(faces + (1 << 30))
-    assert not slow.is_oriented
-    assert np.array_equal(quick.half_a, slow.half_a) and np.array_equal(quick.half_b, slow.half_b)
+    double, lined = np.concatenate([faces, faces]), np.concatenate([faces, faces[:, ::-1]])
+    for closed in (faces, double, lined, faces[:0]):
+        assert is_closed(upload_indices(closed))
+    for open_ in (turned, faces[1:], faces[:-1], np.concatenate([faces, faces[:1]]), faces[:, ::-1] + (faces > 7)):
+        assert not is_closed(upload_indices(open_))
+
+
+def test_outside_is_beyond_the_box_of_the_vertices() -> None:
+    vertices = ball(2)[0].numpy()
+    assert is_outside(np.array([[0.6, 0, 0], [0, 0, -0.51]]), vertices)
+    assert not is_outside(np.array([[0.6, 0, 0], [0.4, 0.4, 0.4]]), vertices)  # beyond the ball, within its box
+
+
+def test_pairs_of_a_closed_mesh_are_those_of_any_mesh() -> None:
+    faces = ball(2)[1].numpy()
+    for mesh in (faces, np.concatenate([faces, faces])):  # in the second, four faces meet in every edge
+        half_edges = np.arange(3 * len(mesh))
+        start, end, _ = (column.astype(np.int32) for column in corners(mesh, half_edges))
+        quick = pair_closed(mesh, half_edges.astype(np.int32), start, end, faces.max() + 1)
+        slow = pair_half_edges(mesh)
+        assert np.array_equal(quick.half_a, slow.half_a) and np.array_equal(quick.half_b, slow.half_b)
+
+
+@pytest.mark.parametrize("count", [1, 5, 40])
+def test_an_outline_is_the_same_whether_all_edges_are_paired_or_few(count: int) -> None:
+    """40 views are more than one number has bits for."""
+    vertices, faces, _ = (tensor.numpy() for tensor in ball(3))
+    vertices = (vertices * (1 + 0.3 * np.sin(7 * vertices[:, :1]))).astype(np.float32)  # bent in places
+    cameras = FilmCameras(views(*range(0, 9 * count, 9)), 32)
+
+    uploaded = upload_floats(vertices), upload_indices(faces)
+
+    def edges(closed: bool) -> list[set[tuple[int, ...]]]:
+        found = find_outline(vertices, faces, cameras, uploaded, closed)
+        pairs = np.sort(found.vertices, axis=1)
+        return [set(map(tuple, pairs[found.view == view].tolist())) for view in range(count)]
+
+    few = edges(closed=True)
+    assert min(map(len, few)) > 20 and edges(closed=False) == few
 
 
 def test_three_faces_at_one_edge() -> None:
     edges = pair_half_edges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert sorted(edges.half_b[edges.half_a % 3 == 0].tolist()) == [-1, 3]
-
-
-def test_cached_edges_are_the_same_edges() -> None:
-    faces, cache = ball(2)[1].numpy(), EdgeCache()
-
-    def pairs(*parts: object) -> set[tuple[int, int]]:
-        return {tuple(sorted(p)) for e in parts for p in zip(e.half_a.tolist(), e.half_b.tolist(), strict=True)}
-
-    expected = pairs(pair_half_edges(faces))
-    first, rest = cache.edges(faces, 150)
-    assert pairs(first, rest) == expected and len(first.half_a) + len(rest.half_a) == len(expected)
-    again, _ = cache.edges(faces, 150)
-    assert again is first and cache.edges(faces, 151)[0] is not first
 
 
 def test_very_large_indices_take_the_slow_sort() -> None:

@@ -11,11 +11,12 @@ from fd_mitsuba.conventions import GEOMETRY_CHANNELS
 from fd_mitsuba.render import bridge
 from fd_mitsuba.render.boundary_term import add_boundary_term, upload_points
 from fd_mitsuba.render.cameras import FilmCameras
+from fd_mitsuba.render.enclosing import is_closed, is_outside
 from fd_mitsuba.render.film_samples import film_position, opaque_seed
 from fd_mitsuba.render.mesh_check import CheckedMesh, check_mesh
 from fd_mitsuba.render.mesh_tracer import Hit, MeshTracer
 from fd_mitsuba.render.outline_points import sample_outline
-from fd_mitsuba.render.silhouette import SilhouetteFinder
+from fd_mitsuba.render.silhouette import find_outline
 from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
 from fd_mitsuba.render.upload import upload_indices
 from fd_mitsuba.render.vertex_normals import area_sums, vertex_normals
@@ -43,7 +44,7 @@ class GeometryPass:
             )
         mitsuba_api.start(mi.variant() or mitsuba_api.DEFAULT_VARIANT)
         self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
-        self._tracer, self._silhouettes = MeshTracer(), SilhouetteFinder()
+        self._tracer = MeshTracer()
         self._static_sums, self._static_sums_build = torch.zeros(0, 3), 0
 
     @property
@@ -99,14 +100,16 @@ class GeometryPass:
             uploaded = (dr.detach(positions), surface.faces)
             film, view = _film_points(views, self.spp, seed)
             pixel_samples, points = dr.width(view), None
+            closed = is_closed(surface.faces)
             if wanted:
-                outline = self._silhouettes.outline(mesh.vertices, mesh.faces, views, mesh.static_faces, uploaded)
+                outline = find_outline(mesh.vertices, mesh.faces, views, uploaded, closed)
                 drawn = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
                 if len(drawn.view):
                     points = upload_points(drawn, self.size)
                     view = dr.concat([view, points.view])
                     film = mi.Point2f(*(dr.concat([a, b]) for a, b in zip(film, points.beside, strict=True)))
-            hit = self._tracer.see(views, film, view, uploaded)
+            from_outside = closed and is_outside(views.position, mesh.vertices)
+            hit = self._tracer.see(views, film, view, uploaded, from_outside)
             picture = self._shade(surface, views, self.spp, seed, hit.part(0, pixel_samples))
             if points is not None:
                 behind = hit.part(pixel_samples, pixel_samples + len(points))

@@ -90,7 +90,14 @@ class MeshTracer:
             face = moving.prim_index + self._static_faces
             return self._before_static(ray, coherent, active, Hit(moving.is_valid(), face, moving.prim_uv, moving.t))
 
-    def see(self, cameras: FilmCameras, film: mi.Point2f, view: mi.UInt32, mesh: tuple[mi.Float, mi.UInt32]) -> Hit:
+    def see(
+        self,
+        cameras: FilmCameras,
+        film: mi.Point2f,
+        view: mi.UInt32,
+        mesh: tuple[mi.Float, mi.UInt32],
+        from_outside: bool = False,
+    ) -> Hit:
         """The same for the rays of film points, drawn or traced, whichever is likely to be sooner; evaluated.
 
         Args:
@@ -98,19 +105,28 @@ class MeshTracer:
             film: (P) points, in pixels; best if neighbours on the film are neighbours here.
             view: (P).
             mesh: flat vertices and faces of the mesh that was set, in Dr.Jit, detached.
+            from_outside: whether the mesh is closed and no camera within it, so that no ray meets a face's back first.
         """
         with dr.suspend_grad():
             dr.eval(film, view)
             if dr.width(view) > _POINTS_PER_FACE * len(self._moving_mesh[1]):
                 return self.trace(cameras.at(view).ray(film), coherent=True)
-        return self.draw(cameras, film, view, mesh)
+        return self.draw(cameras, film, view, mesh, from_outside)
 
-    def draw(self, cameras: FilmCameras, film: mi.Point2f, view: mi.UInt32, mesh: tuple[mi.Float, mi.UInt32]) -> Hit:
+    def draw(
+        self,
+        cameras: FilmCameras,
+        film: mi.Point2f,
+        view: mi.UInt32,
+        mesh: tuple[mi.Float, mi.UInt32],
+        from_outside: bool = False,
+    ) -> Hit:
         """`see` without a hierarchy of the faces that change, of which there must be one at least."""
         with dr.suspend_grad():
             dr.eval(film, view)
             count = len(self._moving_mesh[1])
-            drawn = nearest_faces(sort_points(cameras, film, view), cameras, *mesh, self._static_faces, count)
+            points = sort_points(cameras, film, view)
+            drawn = nearest_faces(points, cameras, *mesh, self._static_faces, count, front_only=from_outside)
             self._set_large(np.array(drawn.large))
             camera = cameras.at(view)
             ray = camera.ray(film)

@@ -7,58 +7,45 @@ import mitsuba as mi
 import numpy as np
 
 from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.mesh_edges import NO_FACE, EdgeCache, MeshEdges, check_welded, corners
+from fd_mitsuba.render.mesh_edges import MeshEdges, check_welded, corners, pair_closed, pair_half_edges
 from fd_mitsuba.render.outline import Outline, clip_outline
-from fd_mitsuba.render.upload import upload_floats, upload_indices
+from fd_mitsuba.render.upload import upload_floats
 
 _VIEWS_AT_ONCE = 32
 """Bits of the number in which a face notes the views that it is turned to."""
 
 
-class SilhouetteFinder:
-    """Finds outlines of meshes whose topology changes; edges of faces that stay the same are kept."""
+def find_outline(
+    vertices: np.ndarray, faces: np.ndarray, cameras: FilmCameras, uploaded: tuple[mi.Float, mi.UInt32], closed: bool
+) -> Outline:
+    """The silhouette edges of all views, within the picture. Concave folds are left out: the surface hides them.
 
-    def __init__(self) -> None:
-        self._cache = EdgeCache()
-        self._fixed: tuple[MeshEdges, mi.UInt32, mi.UInt32] | None = None
+    Args:
+        vertices: (V, 3) float32.
+        faces: (F, 3) int64, welded, outward winding.
+        uploaded: flat vertices and faces in Dr.Jit, detached.
+        closed: what `is_closed` says of them; True saves the search for boundaries.
 
-    def outline(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        cameras: FilmCameras,
-        static_faces: int = 0,
-        uploaded: tuple[mi.Float, mi.UInt32] | None = None,
-    ) -> Outline:
-        """The silhouette edges of all views, within the picture. Concave folds are left out: the surface hides them.
+    Raises:
+        ValueError: vertices not welded, or winding not consistent.
+    """
+    positions, triangles = uploaded
+    every = None if closed else pair_half_edges(faces)
+    if every is not None:
+        check_welded(faces, every)
+    parts = [(np.zeros(0, np.int64),) * 3]
+    for begin in range(0, cameras.count, _VIEWS_AT_ONCE):
+        eyes = cameras.position[begin : begin + _VIEWS_AT_ONCE]
+        facing = _facing(positions, triangles, eyes)
+        edges = every or pair_closed(faces, *_where_it_turns(facing, triangles, len(vertices)), len(vertices))
+        edge, view = _turning(np.array(facing), edges, len(eyes))
+        parts.append((view + begin, edges.half_a[edge], edges.half_b[edge]))
+    view, half_a, half_b = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return clip_outline(*_convex(vertices, faces, view, half_a, half_b), vertices, cameras)
 
-        Args:
-            vertices: (V, 3) float32.
-            faces: (F, 3) int64, welded, outward winding.
-            uploaded: flat vertices and faces in Dr.Jit, detached, where the caller has them already.
 
-        Raises:
-            ValueError: vertices not welded, or winding not consistent.
-        """
-        fixed, moving = self._cache.edges(faces, static_faces)
-        check_welded(faces, moving)
-        if self._fixed is None or self._fixed[0] is not fixed:
-            self._fixed = (fixed, upload_indices(fixed.face_a), upload_indices(fixed.face_b))
-        edge_sets = (self._fixed, (moving, upload_indices(moving.face_a), upload_indices(moving.face_b)))
-        if uploaded is None:
-            uploaded = (upload_floats(vertices), upload_indices(faces))
-        parts = []
-        for begin in range(0, cameras.count, _VIEWS_AT_ONCE):
-            eyes = cameras.position[begin : begin + _VIEWS_AT_ONCE]
-            facing = _facing(*uploaded, eyes)
-            for edges, face_a, face_b in edge_sets:
-                if len(edges.half_a):
-                    edge, view = _turning(facing, face_a, face_b, len(eyes))
-                    parts.append((view + begin, edges.half_a[edge], edges.half_b[edge]))
-        if not parts:
-            parts.append((np.zeros(0, np.int64),) * 3)
-        view, half_a, half_b = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return clip_outline(*_convex(vertices, faces, view, half_a, half_b), vertices, cameras)
+def _count(triangles: mi.UInt32) -> int:
+    return dr.width(triangles) // 3
 
 
 def _facing(positions: mi.Float, triangles: mi.UInt32, eyes: np.ndarray) -> mi.UInt32:
@@ -75,17 +62,41 @@ def _facing(positions: mi.Float, triangles: mi.UInt32, eyes: np.ndarray) -> mi.U
     return bits
 
 
-def _turning(facing: mi.UInt32, face_a: mi.UInt32, face_b: mi.UInt32, views: int) -> tuple[np.ndarray, np.ndarray]:
+def _where_it_turns(facing: mi.UInt32, triangles: mi.UInt32, vertices: int) -> tuple[np.ndarray, ...]:
+    """Half-edges of which both ends have faces turned to an eye and away from it: one in ten; start and end; each (H,).
+
+    In a closed mesh every edge of an outline is among them, with both its half-edges, so nothing else need be paired.
+    """
+    triangle = dr.gather(mi.Vector3u, triangles, dr.arange(mi.UInt32, _count(triangles)))
+    any_face = dr.empty(mi.UInt32, vertices)
+    for index in triangle:
+        dr.scatter(any_face, facing, index)  # whichever comes last: faces that differ do so from one of them, too
+    turns = dr.zeros(mi.UInt32, vertices)
+    for index in triangle:
+        differ = facing ^ dr.gather(mi.UInt32, any_face, index)
+        dr.scatter_reduce(dr.ReduceOp.Or, turns, differ, index, differ != 0)
+    a, b, c = (dr.gather(mi.UInt32, turns, index) for index in triangle)
+    face = dr.compress(((a & b) | (b & c) | (c & a)) != 0)
+    if not dr.width(face):
+        return (np.zeros(0, np.int32),) * 3
+    lane = dr.arange(mi.UInt32, 3 * dr.width(face))
+    corner = lane % 3
+    half = 3 * dr.gather(mi.UInt32, face, lane // 3) + corner
+    start = dr.gather(mi.UInt32, triangles, half)
+    end = dr.gather(mi.UInt32, triangles, dr.select(corner == 2, half - 2, half + 1))
+    lanes = dr.compress((dr.gather(mi.UInt32, turns, start) & dr.gather(mi.UInt32, turns, end)) != 0)
+    chosen = [dr.gather(mi.UInt32, column, lanes) for column in (half, start, end)]
+    dr.eval(chosen)
+    return tuple(np.array(column).view(np.int32) for column in chosen)
+
+
+def _turning(facing: np.ndarray, edges: MeshEdges, views: int) -> tuple[np.ndarray, np.ndarray]:
     """Edge and view of all edges that are a boundary, or lie between a face turned to the eye and one turned away."""
-    first, second = dr.gather(mi.UInt32, facing, face_a), mi.UInt32(0xFFFFFFFF)
-    closed = face_b != NO_FACE
-    differ = dr.select(closed, first ^ dr.gather(mi.UInt32, facing, face_b, closed), second)
-    differ &= mi.UInt32((1 << views) - 1)
-    dr.eval(differ)
-    lanes = dr.compress(differ != 0)
-    bits = np.array(dr.gather(mi.UInt32, differ, lanes))
-    place, view = np.nonzero((bits[:, None] >> np.arange(views, dtype=np.uint32)) & 1)
-    return np.array(lanes).astype(np.int64)[place], view
+    differ = facing[edges.half_a // 3] ^ facing[edges.half_b // 3]
+    differ[edges.half_b < 0] = 0xFFFFFFFF
+    chosen = np.flatnonzero(differ)
+    place, view = np.nonzero((differ[chosen, None] >> np.arange(views, dtype=np.uint32)) & 1)
+    return chosen[place], view
 
 
 def _convex(
