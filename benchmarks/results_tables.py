@@ -28,7 +28,16 @@ PAGE = ROOT / "docs" / "results.md"
 FINISHED = ("finished", "skipped")
 ROUNDING = 1e-9
 JUDGED = ("sim", "dir", "dir_cosine", "sim_simple", "dir_simple")
-RANKED = ("rank", "rank_start", "rank_dir", "rank_dir_start", "rank_part", "rank_part_start")
+RANKED = (
+    "rank",
+    "rank_start",
+    "rank_base",
+    "rank_base_start",
+    "rank_dir",
+    "rank_dir_start",
+    "rank_part",
+    "rank_part_start",
+)
 UNJUDGED = ("psnr", "ssim", "chamfer", "texture", "leakage", "overlap", "valid", "front_in_back", "seconds", "memory")
 UNJUDGED_SHAPE = ("chamfer", "texture", "leakage", "overlap", "valid", "front_in_back", "seconds", "memory")
 
@@ -101,6 +110,8 @@ def run_bars(runs: Sequence[dict], failed: int) -> list[Bar]:
         share("every run ends", lambda found: True),
         share("prompt ranked first among all edit prompts in ≥ 80 %, by CLIP_sim", rank("rank"), 0.8),
         few("... and for the start in ≤ 25 %", rank("rank_start")),
+        share("prompt ranked first among all edit prompts and its own base prompt in ≥ 80 %", rank("rank_base"), 0.8),
+        few("... and for the start in ≤ 25 %", rank("rank_base_start")),
         share("prompt ranked first in ≥ 80 %, by the change (CLIP_dir)", rank("rank_dir"), 0.8),
         few("... and for the start in ≤ 25 %", rank("rank_dir_start")),
         share("part ranked first on its own body in ≥ 80 %", rank("rank_part"), 0.8),

@@ -23,6 +23,7 @@ from fd_mitsuba.evaluation.front_in_back import front_in_back
 from fd_mitsuba.evaluation.judged_views import JudgedViews
 from fd_mitsuba.evaluation.part_check import check_parts
 from fd_mitsuba.evaluation.picture_difference import MOST_DECIBELS, psnr, ssim, ssim_map
+from fd_mitsuba.evaluation.protocol import judged
 from fd_mitsuba.evaluation.similarity import EditPrompt, clip_scores, rank_of, retrieval
 from fd_mitsuba.export.meshes import copy_base
 from fd_mitsuba.fields.texture import TextureField
@@ -133,6 +134,17 @@ def test_retrieval_by_hand() -> None:
     assert found["rank"] == 2 and found["first_views"] == 0 and found["candidates"] == 3  # both views look like the hat
     assert found["rank_dir"] == 1  # but the change goes furthest towards the crown
     assert rank_of([0.3, 0.5, 0.3], 0) == 3 and rank_of([0.3, 0.5, 0.3], 1) == 1
+
+
+def test_a_start_that_looks_like_the_base_ranks_behind_the_base_prompt() -> None:
+    judge = HandMade(crown=(0.0, 1.0), cat=(1.0, 0.0), bone=(-1.0, 0.0), dog=(-1.0, 0.1))
+    judge.images = lambda pictures: pictures
+    edited, start, base = (torch.tensor([place] * 8) for place in ((0.2, 1.0), (1.0, 0.4), (1.0, 0.0)))
+    views = SimpleNamespace(edited=edited, start=start, base=base, azimuth_deg=np.arange(8) * 45.0, kind="normals")
+    found = judged(views, judge, EditPrompt("crown", "cat"), None, [EditPrompt("bone", "dog")], None)
+    alone, with_base = found["retrieval"], found["retrieval_with_base"]
+    assert (alone["rank"], alone["rank_start"], alone["candidates"]) == (1, 1, 2)  # no other sentence has a cat
+    assert (with_base["rank"], with_base["rank_start"], with_base["candidates"]) == (1, 2, 3)
 
 
 def test_front_in_back_counts_back_views_that_look_like_the_front() -> None:

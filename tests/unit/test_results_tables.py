@@ -30,6 +30,7 @@ def run(scene: str, seed: int, folder: Path, rank: int = 1, leakage: float = 0.0
         "views": {"kind": "lit"},
         "clip": {"sim": 0.3 + 0.1 * seed, "dir_dot": 0.05, "dir_cosine": 0.2},
         "retrieval": ranks,
+        "retrieval_with_base": ranks,
         "retrieval_parts": ranks,
         "base": {
             "identical": True,

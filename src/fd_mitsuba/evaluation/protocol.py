@@ -16,7 +16,7 @@ from fd_mitsuba.evaluation.similarity import EditPrompt, Judge, clip_scores, ret
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.scene.edit_scene import EditScene
 
-FORMAT = 1
+FORMAT = 2
 
 
 def judged(
@@ -45,8 +45,10 @@ def judged(
         found["clip_simple"] = by | {"prompt": simple}
         found["clip_simple"] |= clip_scores(judge, edited, base, EditPrompt(simple, words.base_prompt))
     others = [rival for rival in dict.fromkeys(rivals) if rival.prompt != words.prompt]
+    unchanged = EditPrompt(words.base_prompt, words.base_prompt)
     for name, choice in {
         "retrieval": ([words, *others], 0) if others else None,
+        "retrieval_with_base": ([words, *others, unchanged], 0) if others and words.base_prompt else None,
         "retrieval_parts": None if vocabulary is None else other_parts(words.prompt, vocabulary),
     }.items():
         if choice is not None:

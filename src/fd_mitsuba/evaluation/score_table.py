@@ -56,6 +56,8 @@ COLUMNS = {
     "dir_simple": Column("CLIP_dir, simplified ↑", _at("clip_simple", "dir_dot"), 4),
     "rank": Column("rank of prompt ↓", _at("retrieval", "rank")),
     "rank_start": Column("before the run", _at("retrieval", "rank_start")),
+    "rank_base": Column("with the base's ↓", _at("retrieval_with_base", "rank")),
+    "rank_base_start": Column("before the run", _at("retrieval_with_base", "rank_start")),
     "rank_dir": Column("rank by change ↓", _at("retrieval", "rank_dir")),
     "rank_part": Column("rank of part ↓", _at("retrieval_parts", "rank")),
     "rank_part_start": Column("before the run ", _at("retrieval_parts", "rank_start")),
@@ -124,6 +126,8 @@ def summary_lines(results: Sequence[dict]) -> list[str]:
 
     count("own prompt ranked first", "rank", lambda rank: rank == 1)
     count("own prompt ranked first before the run", "rank_start", lambda rank: rank == 1)
+    count("own prompt ranked first, and before the base's", "rank_base", lambda rank: rank == 1)
+    count("own prompt ranked first, and before the base's, before the run", "rank_base_start", lambda rank: rank == 1)
     count("own prompt ranked first by change", "rank_dir", lambda rank: rank == 1)
     count("own part ranked first on its body", "rank_part", lambda rank: rank == 1)
     count("own part ranked first on its body before the run", "rank_part_start", lambda rank: rank == 1)
