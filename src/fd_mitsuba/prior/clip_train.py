@@ -19,13 +19,14 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, avg_pool2d, cross_entropy, grid_sample, interpolate, log_softmax, normalize
 from transformers import CLIPModel, PreTrainedTokenizerFast
 
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.clip_captions import Claim, true_of, write_caption
 from fd_mitsuba.prior.clip_corpus import TRAINING_SEED, render_shards
 from fd_mitsuba.prior.clip_model import WIDTH, build_clip, build_clip_tokenizer, save_evaluator
 from fd_mitsuba.prior.parts import PARTS
 from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
+from fd_mitsuba.training.stop_request import stop_on_signals
 
 KIND = "evaluator"
 DATA = Path("runs") / "clip_data" / "training"
@@ -151,6 +152,7 @@ def train_evaluator(
         least_shards: before the first step; the others come evenly during the training.
 
     Raises:
+        Interrupted: after SIGINT or SIGTERM, with a checkpoint.
         UserError: the folder holds a training of something else or with other words.
     """
     files = TrainingFolder(folder)
@@ -178,43 +180,46 @@ def train_evaluator(
         state["seconds"] = before + time.time() - started
         files.save(state)
 
-    while step < total_steps and time.time() - started < seconds:
-        progress = max(step / total_steps, (time.time() - started) / seconds)
-        if step % 10 == 0 or smooth is None:
-            shelf.fill(max(least_shards, math.ceil(step / total_steps * SHARDS)))
-        for group in optimiser.param_groups:
-            group["lr"] = (
-                LEARNING_RATE * min(1.0, (step + 1) / 60) * (0.01 + 0.495 * (1 + math.cos(math.pi * progress)))
-            )
-        pictures, shown, shares, captions, claims = shelf.batch(batch_size)
-        pictures, shares = augmented(pictures, shares, generator)
-        kept = KEPT_PATCHES if progress < ALL_PATCHES_FROM else None
-        image, summary, patches = see(model, pictures, shares, kept)
-        text = read(model, tokenizer, captions)
-        scale = model.logit_scale.exp().clamp(max=50)
-        matches = torch.from_numpy(true_of(claims, shown))
-        contrast = contrastive_loss(scale * normalize(image, dim=-1) @ normalize(text, dim=-1).T, matches)
-        share = shares[:, 0].flatten(1)
-        share = share if kept is None else share.gather(1, _fullest(shares, kept))
-        aid = aid_loss(aids, summary, patches, share, torch.from_numpy(shown))
-        (contrast + 0.5 * aid).backward()
-        torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
-        step += 1
-        follow(average, model, min(0.995, step / (step + 10)))
-        smooth = smoothed(smooth, (contrast.item(), aid.item()), 0.97)
-        if step % 25 == 0:
-            line = {"step": step, "contrast": round(smooth[0], 4), "aid": round(smooth[1], 4)}
-            line |= {
-                "scale": round(scale.item(), 1),
-                "shards": len(shelf),
-                "seconds": round(before + time.time() - started),
-            }
-            files.log(line)
-        if files.is_due():
-            save()
+    with stop_on_signals() as stop:
+        while step < total_steps and time.time() - started < seconds and stop.name is None:
+            progress = max(step / total_steps, (time.time() - started) / seconds)
+            if step % 10 == 0 or smooth is None:
+                shelf.fill(max(least_shards, math.ceil(step / total_steps * SHARDS)))
+            for group in optimiser.param_groups:
+                group["lr"] = (
+                    LEARNING_RATE * min(1.0, (step + 1) / 60) * (0.01 + 0.495 * (1 + math.cos(math.pi * progress)))
+                )
+            pictures, shown, shares, captions, claims = shelf.batch(batch_size)
+            pictures, shares = augmented(pictures, shares, generator)
+            kept = KEPT_PATCHES if progress < ALL_PATCHES_FROM else None
+            image, summary, patches = see(model, pictures, shares, kept)
+            text = read(model, tokenizer, captions)
+            scale = model.logit_scale.exp().clamp(max=50)
+            matches = torch.from_numpy(true_of(claims, shown))
+            contrast = contrastive_loss(scale * normalize(image, dim=-1) @ normalize(text, dim=-1).T, matches)
+            share = shares[:, 0].flatten(1)
+            share = share if kept is None else share.gather(1, _fullest(shares, kept))
+            aid = aid_loss(aids, summary, patches, share, torch.from_numpy(shown))
+            (contrast + 0.5 * aid).backward()
+            torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+            step += 1
+            follow(average, model, min(0.995, step / (step + 10)))
+            smooth = smoothed(smooth, (contrast.item(), aid.item()), 0.97)
+            if step % 25 == 0:
+                line = {"step": step, "contrast": round(smooth[0], 4), "aid": round(smooth[1], 4)}
+                line |= {
+                    "scale": round(scale.item(), 1),
+                    "shards": len(shelf),
+                    "seconds": round(before + time.time() - started),
+                }
+                files.log(line)
+            if files.is_due():
+                save()
     save()
+    if stop.name is not None:
+        raise Interrupted(f"{stop.name}: stopped after step {step} of {total_steps}; the same command goes on")
 
 
 def read(model: CLIPModel, tokenizer: PreTrainedTokenizerFast, captions: list[str]) -> Tensor:

@@ -149,7 +149,8 @@ def build_scheduler(prediction_type: str) -> DDIMScheduler:
     )
 
 
-def encode_text(tokenizer: PreTrainedTokenizerFast, encoder: CLIPTextModel, texts: list[str]) -> torch.Tensor:
-    """Text states (B, TEXT_LENGTH, width); gradients flow."""
-    tokens = tokenizer(texts, padding="max_length", max_length=TEXT_LENGTH, truncation=True, return_tensors="pt")
-    return encoder(tokens.input_ids).last_hidden_state
+def tokenize(tokenizer: PreTrainedTokenizerFast, texts: list[str]) -> torch.Tensor:
+    """Token numbers (B, TEXT_LENGTH), padded."""
+    return tokenizer(
+        texts, padding="max_length", max_length=TEXT_LENGTH, truncation=True, return_tensors="pt"
+    ).input_ids

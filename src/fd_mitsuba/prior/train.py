@@ -12,14 +12,16 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d
 
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import HELD_OUT
 from fd_mitsuba.prior.corpus import Pair
 from fd_mitsuba.prior.kinds import GEOMETRY, Kind
-from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, encode_text, load_packed
+from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, load_packed, tokenize
 from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.replicas import Replicas
 from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
+from fd_mitsuba.training.stop_request import stop_on_signals
 
 OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
 """Bodies that most pictures show; the others keep the copying of the base general."""
@@ -29,6 +31,7 @@ PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3
     ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
 )
 """How much more often than the others the parts of few pixels are drawn, and those that come out worst."""
+ShareLoss = tuple[torch.Tensor, torch.Tensor]
 
 
 def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
@@ -109,13 +112,14 @@ def train(
     scheduler, state = build_scheduler(kind.prediction), files.load()
     tokenizer = build_tokenizer()
     modules = kind.build_modules(tokenizer)
-    encoder, unet = modules["text_encoder"], modules["unet"].to(memory_format=torch.channels_last)
+    modules["unet"].to(memory_format=torch.channels_last)
     if init is not None and state is None:
         load_packed(init, modules, tokenizer, kind.prediction)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     optimiser = torch.optim.AdamW(
         modules.parameters(), lr=kind.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
     )
+    before = 0.0
     step, small_steps = 0, 0 if init is not None else kind.small_steps
     if state is not None:
         if state.get("kind", GEOMETRY.name) != kind.name:
@@ -128,8 +132,9 @@ def train(
             )
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
-        average, step = state["average"], state["step"]
+        average, step, before = state["average"], state["step"], state.get("seconds", 0.0)
         small_steps = state.get("small_steps", kind.small_steps)
+    replicas = Replicas(modules, min(torch.get_num_threads(), batch_size))
     alphas = scheduler.alphas_cumprod
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     pool = Pool(kind, seed * 7919 + step) if pairs is None else pairs
@@ -139,57 +144,81 @@ def train(
     def save() -> None:
         state = {"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average}
         state |= {"step": step, "vocabulary": tokenizer.get_vocab(), "kind": kind.name, "small_steps": small_steps}
+        state["seconds"] = before + time.time() - started
         files.save(state)
 
-    while step < total_steps and time.time() - started < seconds:
-        warm = min(1.0, (step + 1) / 150)
-        rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        base, edited, changed, captions = pool.batch(batch_size)
-        if step < small_steps:
-            base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
-            changed = (avg_pool2d(changed, 2) > 0.4).float()
-        draw = torch.rand(batch_size, generator=generator).tolist()
-        captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
-        keep_base = torch.tensor([0.0 if 0.06 < u < 0.14 else 1.0 for u in draw])[:, None, None, None]
-        times = (1000 * torch.rand(batch_size, generator=generator) ** kind.time_power).long().clamp(max=999)
-        noise = torch.randn(edited.shape, generator=generator)
-        if kind.masked_noise:
-            masked = torch.rand(batch_size, generator=generator) < kind.masked_noise
-            noise = torch.where(masked[:, None, None, None], noise * changed, noise)
-        a = alphas[times][:, None, None, None]
-        noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
-        target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
-        condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
-        with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            predicted = unet(condition, times, encode_text(tokenizer, encoder, captions)).sample
-        predicted = predicted.float() + base * keep_base if kind.difference else predicted.float()
-        error = squared_error(predicted - target, kind.tint_weight)
-        loss = (error * (1 + kind.part_weight * changed)).mean()
-        if kind.copy_weight:
-            loss = loss + kind.copy_weight * ((predicted - target).abs() * (1 - changed)).mean()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
-        step += 1
-        follow(average, modules, min(0.998, step / (step + 10)))
-        on_part = ((error * changed).sum() / (4 * changed.sum() + 1)).item()
-        smooth = smoothed(smooth, (error.mean().item(), on_part), 0.98)
-        pool.refresh(kind.fresh_pairs)
-        if step % 50 == 0:
-            line = {
-                "step": step,
-                "loss": round(smooth[0], 5),
-                "loss_part": round(smooth[1], 5),
-                "rate": rate,
-                "seconds": round(time.time() - started),
-            }
-            files.log(line)
-        if files.is_due():
-            save()
+    with stop_on_signals() as stop:
+        while step < total_steps and time.time() - started < seconds and stop.name is None:
+            warm = min(1.0, (step + 1) / 150)
+            rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            base, edited, changed, captions = pool.batch(batch_size)
+            if step < small_steps:
+                base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
+                changed = (avg_pool2d(changed, 2) > 0.4).float()
+            draw = torch.rand(batch_size, generator=generator).tolist()
+            captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
+            keep_base = torch.tensor([0.0 if 0.06 < u < 0.14 else 1.0 for u in draw])[:, None, None, None]
+            times = (1000 * torch.rand(batch_size, generator=generator) ** kind.time_power).long().clamp(max=999)
+            noise = torch.randn(edited.shape, generator=generator)
+            if kind.masked_noise:
+                masked = torch.rand(batch_size, generator=generator) < kind.masked_noise
+                noise = torch.where(masked[:, None, None, None], noise * changed, noise)
+            a = alphas[times][:, None, None, None]
+            noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
+            target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
+            condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
+            kept = base * keep_base if kind.difference else torch.zeros_like(edited)
+            batch = condition, times, tokenize(tokenizer, captions), target - kept, changed
+
+            def share(modules: torch.nn.ModuleDict, samples: slice, batch: Sequence[torch.Tensor] = batch) -> ShareLoss:
+                return share_loss(modules, kind, half, *(values[samples] for values in batch))
+
+            error = torch.cat(replicas.backward(share, batch_size))
+            torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+            step += 1
+            follow(average, modules, min(0.998, step / (step + 10)))
+            on_part = ((error * changed).sum() / (4 * changed.sum() + 1)).item()
+            smooth = smoothed(smooth, (error.mean().item(), on_part), 0.98)
+            pool.refresh(kind.fresh_pairs)
+            if step % 50 == 0:
+                line = {
+                    "step": step,
+                    "loss": round(smooth[0], 5),
+                    "loss_part": round(smooth[1], 5),
+                    "rate": rate,
+                    "seconds": round(before + time.time() - started),
+                }
+                files.log(line)
+            if files.is_due():
+                save()
     save()
+    if stop.name is not None:
+        raise Interrupted(f"{stop.name}: stopped after step {step} of {total_steps}; the same command goes on")
+
+
+def share_loss(
+    modules: torch.nn.ModuleDict,
+    kind: Kind,
+    half: bool,
+    condition: torch.Tensor,
+    times: torch.Tensor,
+    tokens: torch.Tensor,
+    wanted: torch.Tensor,
+    changed: torch.Tensor,
+) -> ShareLoss:
+    """Mean loss of some samples, and the errors' squares (N, 4, H, W), detached."""
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        words = modules["text_encoder"](tokens).last_hidden_state
+        away = modules["unet"](condition, times, words).sample.float() - wanted
+    error = squared_error(away, kind.tint_weight)
+    loss = (error * (1 + kind.part_weight * changed)).mean()
+    if kind.copy_weight:
+        loss = loss + kind.copy_weight * (away.abs() * (1 - changed)).mean()
+    return loss, error.detach()
 
 
 def squared_error(difference: torch.Tensor, tint_weight: float) -> torch.Tensor:

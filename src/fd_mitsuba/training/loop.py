@@ -2,45 +2,16 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 from fd_mitsuba.errors import Interrupted
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, load_newest, save_checkpoint
 from fd_mitsuba.training.record import Recorder
 from fd_mitsuba.training.stage import Stage
+from fd_mitsuba.training.stop_request import stop_on_signals
 
 _FIELD_CHECKED_EVERY = 10
-
-
-class _StopRequest:
-    """Set by SIGINT or SIGTERM; a second signal ends the process as if nobody listened."""
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.name = signal.Signals(number).name
-        signal.signal(number, signal.SIG_DFL)
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[_StopRequest]:
-    """While open, SIGINT and SIGTERM are noted instead of ending the process; outside the main thread nothing is."""
-    request = _StopRequest()
-    if threading.current_thread() is not threading.main_thread():
-        yield request
-        return
-    old = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield request
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def run_stage(
