@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
 import torch
 
-from fd_mitsuba.errors import UserError
+import fd_mitsuba.prior.train as train_module
+from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
 from fd_mitsuba.prior.kinds import APPEARANCE, KINDS, kind_named
 from fd_mitsuba.prior.pack import pack
 from fd_mitsuba.prior.train import train
+from fd_mitsuba.prior.training_folder import TrainingFolder
 
 
 def test_training_resumes_and_starts_from_packed_weights(tmp_path: Path) -> None:
@@ -48,3 +52,14 @@ def test_kinds_are_named() -> None:
     assert {kind_named(name).name for name in KINDS} == {"geometry", "appearance"}
     with pytest.raises(UserError, match="known: geometry, appearance"):
         kind_named("smell")
+
+
+def test_a_signal_ends_the_training_with_what_it_has_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(folder: TrainingFolder, line: dict) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(train_module, "LOG_EVERY", 1)
+    monkeypatch.setattr(TrainingFolder, "log", interrupted)
+    with pytest.raises(Interrupted, match=r"SIGTERM: stopped after step 1 of 4; the same command goes on"):
+        train(tmp_path / "run", seconds=600, batch_size=2, total_steps=4)
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1

@@ -31,6 +31,7 @@ PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3
     ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
 )
 """How much more often than the others the parts of few pixels are drawn, and those that come out worst."""
+LOG_EVERY = 50
 ShareLoss = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -184,7 +185,7 @@ def train(
             on_part = ((error * changed).sum() / (4 * changed.sum() + 1)).item()
             smooth = smoothed(smooth, (error.mean().item(), on_part), 0.98)
             pool.refresh(kind.fresh_pairs)
-            if step % 50 == 0:
+            if step % LOG_EVERY == 0:
                 line = {
                     "step": step,
                     "loss": round(smooth[0], 5),
