@@ -11,6 +11,7 @@ from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
 from fd_mitsuba.guidance.model_conventions import FILE_NAME
+from fd_mitsuba.guidance.side_by_side import cores_for_samples, of_samples
 from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, Query, passes_of
 
 
@@ -58,20 +59,19 @@ class Denoiser:
             inputs = torch.cat([z_t.repeat(passes, 1, 1, 1), torch.cat(seen)], dim=1)
         elif passes > 1:
             inputs = z_t.repeat(passes, 1, 1, 1)
-        times, embeddings = timesteps.repeat(passes), torch.cat(list(texts.values()))
-        outputs = [
-            unet(part.to(unet.dtype), time, encoder_hidden_states=text.to(unet.dtype), return_dict=False)[0].float()
-            for part, time, text in zip(
-                *(whole.split(self.config.views_per_call) for whole in (inputs, times, embeddings)), strict=True
-            )
-        ]
+        columns = inputs.to(unet.dtype), timesteps.repeat(passes), torch.cat(list(texts.values())).to(unet.dtype)
+        cores = cores_for_samples(unet, self.device)
+        outputs = of_samples(self._unet, columns, self.config.views_per_call, cores)
         if self.adds_to_base:
-            outputs = [torch.cat(outputs) + torch.cat(seen)]
+            outputs = outputs + torch.cat(seen)
         alpha_bar = self.alpha_bars[timesteps]
         return {
             name: sds.noise_from_prediction(output, z_t, alpha_bar, self.prediction_type)
-            for name, output in zip(texts, torch.cat(outputs).chunk(passes), strict=True)
+            for name, output in zip(texts, outputs.chunk(passes), strict=True)
         }
+
+    def _unet(self, inputs: Tensor, times: Tensor, texts: Tensor) -> Tensor:
+        return self.components.unet(inputs, times, encoder_hidden_states=texts, return_dict=False)[0].float()
 
     def passes(self, how: Distillation) -> tuple[str, ...]:
         """Names of the network's passes that the variant and the scales ask for."""
