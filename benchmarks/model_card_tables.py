@@ -16,6 +16,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CARD = ROOT / "src" / "fd_mitsuba" / "prior" / "MODEL_CARD.md"
 
+_SAMPLE_COLUMNS = (
+    *("recall", "recall_in_truth", "body_named", "body_named_in_truth"),
+    *("body_kept", "body_kept_in_truth", "shape_kept"),
+)
+
 
 def share(value: float | None) -> str:
     """A percentage, or a dash for None."""
@@ -24,10 +29,11 @@ def share(value: float | None) -> str:
 
 def samples_table(report: dict) -> list[str]:
     """Rows a part, then all of them, unseen pairs, and prompts without a part."""
-    lines = ["| part | samples | found | in truth | body kept | its shape |", "|---|---|---|---|---|---|"]
+    titles = "part | samples | found | in truth | body named | in truth | its pixels kept | in truth | its shape"
+    lines = [f"| {titles} |", "|---" * 9 + "|"]
     named = {**report["per_part"], "all": report["overall"], "pairs kept out of training": report["held_out"]}
     for name, row in named.items():
-        cells = [share(row[key]) for key in ("recall", "recall_in_truth", "body_kept", "shape_kept")]
+        cells = [share(row[key]) for key in _SAMPLE_COLUMNS]
         lines.append(f"| {name} | {row['samples']} | {' | '.join(cells)} |")
     plain = report["plain"]
     lines += [

@@ -192,7 +192,9 @@ def _evaluator_evaluate(options: argparse.Namespace) -> int:
 
 
 def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) -> None:
+    from fd_mitsuba.evaluation.clip import ClipJudge
     from fd_mitsuba.prior.bodies import BODIES
+    from fd_mitsuba.prior.body_namer import BodyNamer
     from fd_mitsuba.prior.evaluate_parts import evaluate_parts
     from fd_mitsuba.prior.part_judge import CHECKOUT_CLASSIFIER, load_judge
     from fd_mitsuba.prior.parts import PARTS
@@ -216,13 +218,14 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
         options.steps,
         options.scale,
         not options.overviews,
+        BodyNamer(ClipJudge.load()),
         remark,
     )
     for part, row in {**report["per_part"], "kept out of training": report["held_out"]}.items():
         print(
             f"{part}: {row['samples']} samples, found in {_share(row['recall'])} (in the true pictures in "
-            f"{_share(row['recall_in_truth'])}), body kept in {_share(row['body_kept'])}, its shape in "
-            f"{_share(row['shape_kept'])}"
+            f"{_share(row['recall_in_truth'])}), body named in {_share(row['body_named'])}, kept pixel by pixel in "
+            f"{_share(row['body_kept'])}, its shape in {_share(row['shape_kept'])}"
         )
     for name, bar in report["bars"].items():
         print(f"{name}: {_share(bar['measured'])}, wanted {bar['least']:.0%}")

@@ -12,7 +12,8 @@ CARD = ROOT / "src" / "fd_mitsuba" / "prior" / "MODEL_CARD.md"
 
 
 def test_tables_are_filled_from_the_files_that_are_there(tmp_path: Path) -> None:
-    row = {"samples": 36, "recall": 0.9, "recall_in_truth": 1.0, "body_kept": None, "shape_kept": 0.95}
+    row = {"samples": 36, "recall": 0.9, "recall_in_truth": 1.0, "body_named": 0.97, "body_named_in_truth": 0.99}
+    row |= {"body_kept": None, "body_kept_in_truth": 0.86, "shape_kept": 0.95}
     report = {"per_part": {"horn": row}, "overall": row, "held_out": row, "plain": {"samples": 54, "unchanged": 0.98}}
     runs = tmp_path / "runs"
     (runs / "prior_in_3d").mkdir(parents=True)
@@ -42,7 +43,7 @@ def test_tables_are_filled_from_the_files_that_are_there(tmp_path: Path) -> None
     for _ in range(2):  # a second time it replaces what the first wrote
         said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         text = card.read_text(encoding="utf-8")
-        assert text.count("| horn | 36 | 90% | 100% | - | 95% |") == 1
+        assert text.count("| horn | 36 | 90% | 100% | 97% | 99% | - | 86% | 95% |") == 1
         assert "unchanged in 98% of 54" in text
         assert "| a cat with horns (untrained) | 75% | 0% | horns |" in text
         assert "| a dog with a horn | - | - | the part vanished |" in text

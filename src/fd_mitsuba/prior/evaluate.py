@@ -145,7 +145,12 @@ def _differs(latent: np.ndarray, base: np.ndarray) -> np.ndarray:
     return np.abs(latent - base).max(0) > 2 * KEPT_WITHIN
 
 
+def colours(latents: np.ndarray) -> np.ndarray:
+    """Colours (..., 3, H, W) in [0, 1] of geometry latents (..., 4, H, W): (n + 1) / 2 on black."""
+    mask = (latents[..., 3:, :, :] + 1) / 2
+    return np.clip((latents[..., :3, :, :] + mask) / 2, 0, 1)
+
+
 def picture(latent: np.ndarray) -> np.ndarray:
-    """Colours (H, W, 3) uint8 of a geometry latent (4, H, W), on black."""
-    mask = (latent[3:] + 1) / 2
-    return (np.clip((latent[:3] + mask) / 2, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
+    """The same of one latent as bytes (H, W, 3)."""
+    return (colours(latent) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)

@@ -14,6 +14,7 @@ from PIL import Image
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.prior.bodies import BODIES
+from fd_mitsuba.prior.body_namer import BodyNamer
 from fd_mitsuba.prior.captions import HELD_OUT
 from fd_mitsuba.prior.corpus import Pair, make_pairs
 from fd_mitsuba.prior.evaluate import (
@@ -21,6 +22,7 @@ from fd_mitsuba.prior.evaluate import (
     UNSEEN_SEED,
     body_pixels,
     check_names,
+    colours,
     draw_samples,
     keeps_body,
     picture,
@@ -45,8 +47,13 @@ class JudgedSample:
             whether it says `none`. None where no view shows it, or without a classifier.
         found_in_truth: the same for the picture that the corpus has: what the classifier can tell at all.
         views_found: share of those views in which it says so.
+        body_named: whether another model, not trained with the prior, still names the right body by the mean over the
+            views. None for views centred on the part, or without such a model.
+        body_named_in_truth: the same for the picture that the corpus has.
         body_kept: see `evaluate.keeps_body`; within 0.15, which a shift in shading already breaks.
-        shape_kept: the same with 0.5, half the length of a normal: nothing of the body is gone or replaced.
+        body_kept_in_truth: the same for another part of the same name, the corpus' own: one that is larger, or sits
+            elsewhere, covers pixels that count as the body's. None for views centred on the part.
+        shape_kept: as `body_kept` with 0.5, half the length of a normal: nothing of the body is gone or replaced.
         body_error: mean of the largest channel's difference over those pixels.
         unchanged: at most 1 % of the pixels differ from the base.
     """
@@ -58,7 +65,10 @@ class JudgedSample:
     found: bool | None
     found_in_truth: bool | None
     views_found: float | None
+    body_named: bool | None
+    body_named_in_truth: bool | None
     body_kept: bool
+    body_kept_in_truth: bool | None
     shape_kept: bool
     body_error: float
     unchanged: bool
@@ -74,6 +84,7 @@ def evaluate_parts(
     steps: int = 16,
     scale: float = 2.0,
     closeups: bool = True,
+    namer: BodyNamer | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict:
     """Sample, judge, and write the sheet `output` (a row of truth and one of samples a body) and `output`.json.
@@ -84,6 +95,7 @@ def evaluate_parts(
         bodies, parts: names of the vocabulary; every pair is sampled.
         steps, scale: of DDIM, and of the text guidance.
         closeups: also the views that are centred on the part.
+        namer: None leaves out whether the body is still named right.
         say: takes a line a body.
 
     Returns:
@@ -98,12 +110,19 @@ def evaluate_parts(
     judged: list[JudgedSample] = []
     for body in bodies:
         number = list(BODIES).index(body)
-        pairs = make_pairs(body, [*parts, *[None] * PLAIN_PROMPTS], UNSEEN_SEED + 1000 * seed + number)
+        body_seed = UNSEEN_SEED + 1000 * seed + number
+        pairs = make_pairs(body, [*parts, *[None] * PLAIN_PROMPTS], body_seed)
         pairs = sorted((p for p in pairs if closeups or not p.closeup), key=lambda p: p.closeup)
+        # The same body and overview again, whose second parts of each name are others.
+        again = [p for p in make_pairs(body, [*parts, *parts], body_seed) if not p.closeup]
+        others: dict[str | None, Pair] = {p.part: p for p in again[len(parts) :]}
         base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
         captions = [pair.caption for pair in pairs]
         samples = draw_samples(guidance, base, captions, seed * 100 + number, steps, scale).numpy()
-        of_body = [judge_sample(pair, sample, judge) for pair, sample in zip(pairs, samples, strict=True)]
+        of_body = [
+            judge_sample(pair, sample, judge, None if pair.closeup else others.get(pair.part), namer)
+            for pair, sample in zip(pairs, samples, strict=True)
+        ]
         judged += of_body
         rows += [[picture(pair.edited / 127.0) for pair in pairs], [picture(sample) for sample in samples]]
         found = [sample.found for sample in of_body if sample.part and sample.found is not None]
@@ -119,8 +138,14 @@ def evaluate_parts(
     return report
 
 
-def judge_sample(pair: Pair, sample: np.ndarray, judge: PartJudge | None) -> JudgedSample:
-    """What the classifier says of one sampled mosaic (4, 64, 64)."""
+def judge_sample(
+    pair: Pair,
+    sample: np.ndarray,
+    judge: PartJudge | None,
+    other: Pair | None = None,
+    namer: BodyNamer | None = None,
+) -> JudgedSample:
+    """What is said of one sampled mosaic (4, 64, 64); `other` is the same view with another such part."""
     base, truth = (latent.astype(np.float32) / 127 for latent in (pair.base, pair.edited))
     before, after, wanted = (views_of(mosaic[None]) for mosaic in (base, sample, truth))
     found = in_truth = share = None
@@ -133,11 +158,17 @@ def judge_sample(pair: Pair, sample: np.ndarray, judge: PartJudge | None) -> Jud
     unchanged = float((np.abs(sample - base).max(0) > 0.3).mean()) <= _UNCHANGED_SHARE
     held_out = (pair.body, pair.part) in HELD_OUT
     kept, shape = (keeps_body(base, truth, sample, within) for within in (KEPT_WITHIN, _SHAPE_WITHIN))
+    in_truth_kept = None if other is None else keeps_body(base, truth, other.edited.astype(np.float32) / 127)
+    named = named_in_truth = None
+    if namer is not None and not pair.closeup:
+        named, named_in_truth = (namer(colours(views), pair.part) == pair.body for views in (after, wanted))
     body = body_pixels(base, truth)
     error = round(float(np.abs(sample - base).max(0)[body].mean()), 4) if body.any() else 0.0
     return JudgedSample(
-        pair.body, pair.part, pair.closeup, held_out, found, in_truth, share, kept, shape, error, unchanged
-    )
+        pair.body, pair.part, pair.closeup, held_out,
+        found, in_truth, share, named, named_in_truth,
+        kept, in_truth_kept, shape, error, unchanged,
+    )  # fmt: skip
 
 
 def summary(samples: Sequence[JudgedSample]) -> dict:
@@ -152,7 +183,10 @@ def summary(samples: Sequence[JudgedSample]) -> dict:
             "recall": _mean([s.found for s in chosen]),
             "recall_in_truth": _mean([s.found_in_truth for s in chosen]),
             "recall_of_views": _mean([s.views_found for s in chosen]),
+            "body_named": _mean([s.body_named for s in chosen]),
+            "body_named_in_truth": _mean([s.body_named_in_truth for s in chosen]),
             "body_kept": _mean([s.body_kept for s in chosen]),
+            "body_kept_in_truth": _mean([s.body_kept_in_truth for s in chosen]),
             "shape_kept": _mean([s.shape_kept for s in chosen]),
             "body_error": _mean([s.body_error for s in chosen]),
         }
@@ -168,7 +202,8 @@ def summary(samples: Sequence[JudgedSample]) -> dict:
     bars = {
         "recall": (overall["recall"], LEAST_RECALL),
         "recall of the weakest part": (min(recalls, default=None), LEAST_RECALL_OF_A_PART),
-        "body kept": (overall["body_kept"], LEAST_KEPT),
+        "body named": (overall["body_named"], LEAST_KEPT),
+        "body kept pixel by pixel": (overall["body_kept"], LEAST_KEPT),
         "unchanged without a part": (unchanged, LEAST_UNCHANGED),
     }
     return {
