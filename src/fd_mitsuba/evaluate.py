@@ -24,6 +24,7 @@ from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.threads import rendering_threads
 from fd_mitsuba.training.json_object import read_json_object
 from fd_mitsuba.training.record import write_picture
 from fd_mitsuba.training.run_folder import write_json
@@ -86,10 +87,12 @@ def evaluate_run(
     if appearance is None and protocol.pictures == "lit":
         raise UserError(f"{folder}: its appearance stage has not begun; evaluate its shape instead")
     if appearance is not None:
-        views = lit_views(appearance, protocol.views, protocol.size, protocol.spp)
+        with rendering_threads():
+            views = lit_views(appearance, protocol.views, protocol.size, protocol.spp)
     else:
         stage = load_finished_stage(scene, config, folder)
-        views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
+        with rendering_threads():
+            views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
     vocabulary = builtin_vocabulary()
     own, simple = _words(scene)
     known_to_builtin = vocabulary is not None and ScenePrompts(scene.path, own, simple).known_to(vocabulary)

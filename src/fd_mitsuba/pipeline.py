@@ -32,6 +32,7 @@ from fd_mitsuba.geometry import (
     take_geometry,
 )
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.threads import rendering_threads
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
@@ -93,7 +94,8 @@ def run(
         take_geometry(geometry_from, folder)
     else:
         geometry = load_finished_stage(scene, config, folder)
-    metrics = export_geometry(geometry, folder)
+    with rendering_threads():
+        metrics = export_geometry(geometry, folder)
 
     def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)
@@ -107,10 +109,12 @@ def run(
             scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
         )
         run_stage(appearance, folder, resume, quiet, say)
-        field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
+        with rendering_threads():
+            field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
         write_metrics()
     if with_assets:
-        write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+        with rendering_threads():
+            write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
     # Written last of all: a folder without it is not finished.
     done = {"geometry", *stages}
     metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import drjit as dr
 import pytest
 import torch
 
@@ -12,14 +13,26 @@ from fd_mitsuba import threads
 
 def test_the_network_gets_the_cores_and_gives_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
     before = torch.get_num_threads()
-    monkeypatch.setattr(threads, "_network_threads", None)
+    monkeypatch.setattr(threads, "_cores", None)
     with threads.network_threads():
         assert torch.get_num_threads() == before  # nobody shared the cores yet
-    monkeypatch.setattr(threads, "_network_threads", before + 1)
+    monkeypatch.setattr(threads, "_cores", before + 1)
     with pytest.raises(KeyError), threads.network_threads():
         assert torch.get_num_threads() == before + 1
         raise KeyError
     assert torch.get_num_threads() == before
+
+
+def test_pictures_get_the_cores_and_give_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = dr.thread_count()
+    monkeypatch.setattr(threads, "_cores", None)
+    with threads.rendering_threads():
+        assert dr.thread_count() == before
+    monkeypatch.setattr(threads, "_cores", before + 1)
+    with pytest.raises(KeyError), threads.rendering_threads():
+        assert dr.thread_count() == before + 1
+        raise KeyError
+    assert dr.thread_count() == before
 
 
 def test_the_renderer_shares_only_where_there_are_cores_to_spare() -> None:
