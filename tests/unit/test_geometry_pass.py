@@ -270,7 +270,7 @@ def test_an_outline_is_the_same_whether_all_edges_are_paired_or_few(count: int) 
     uploaded = upload_floats(vertices), upload_indices(faces)
 
     def edges(closed: bool) -> list[set[tuple[int, ...]]]:
-        found = find_outline(vertices, faces, cameras, uploaded, closed)
+        found = find_outline(faces, cameras, uploaded, closed)
         pairs = np.sort(found.vertices, axis=1)
         return [set(map(tuple, pairs[found.view == view].tolist())) for view in range(count)]
 

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from fd_mitsuba.render.upload import upload_floats
+from fd_mitsuba.render.upload import upload_doubles, upload_floats
 from fd_mitsuba.scene.views import CameraBatch
 
 
@@ -66,11 +66,18 @@ class FilmCameras:
         self.half_width = np.tan(np.radians(cameras.fov_deg.astype(np.float64)) / 2)
         self._vectors = [_upload(v) for v in (right, up, back, cameras.position)]
         self._half_width = upload_floats(self.half_width)
+        exact = np.concatenate([self.axes.reshape(self.count, 9), self.position, self.half_width[:, None]], axis=1)
+        self._exact = [upload_doubles(column) for column in exact.T]
 
     def at(self, view: mi.UInt32) -> FilmCamera:
         """The cameras of the given views (B of them are numbered from 0)."""
         right, up, back, position = (dr.gather(mi.Vector3f, v, view) for v in self._vectors)
         return FilmCamera(right, up, back, mi.Point3f(position), dr.gather(mi.Float, self._half_width, view), self.size)
+
+    def exactly(self, view: mi.UInt32) -> tuple[mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Float64]:
+        """Right, up, back, position and half the film's width at depth 1 of the given views, in double precision."""
+        values = [dr.gather(mi.Float64, column, view) for column in self._exact]
+        return (*(mi.Vector3d(*values[k : k + 3]) for k in (0, 3, 6, 9)), values[12])
 
 
 def _upload(vectors: np.ndarray) -> mi.Vector3f:

@@ -102,7 +102,7 @@ class GeometryPass:
             pixel_samples, points = dr.width(view), None
             closed = is_closed(surface.faces)
             if wanted:
-                outline = find_outline(mesh.vertices, mesh.faces, views, uploaded, closed)
+                outline = find_outline(mesh.faces, views, uploaded, closed)
                 drawn = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
                 if len(drawn.view):
                     points = upload_points(drawn, self.size)

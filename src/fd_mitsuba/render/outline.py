@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from fd_mitsuba.render.cameras import FilmCameras
+from fd_mitsuba.render.mesh_edges import MeshEdges
+from fd_mitsuba.render.upload import upload_indices
 
 _NEAREST_DEPTH = 1e-3
 """Edges are cut off where they come nearer to the camera's plane than this."""
 
 _TILE = 4
 """Pixels a side of the tiles by which outline edges are sorted."""
+
+_FIELDS = (((), int), ((2,), int), ((2, 2), float), ((2,), float), ((2,), float), ((2,), float))
+"""Shape of a row and type of the fields of `Outline`."""
 
 
 @dataclass(frozen=True)
@@ -34,79 +41,93 @@ class Outline:
 
 
 def clip_outline(
-    view: np.ndarray, pair: np.ndarray, opposite: np.ndarray, vertices: np.ndarray, cameras: FilmCameras
+    view: np.ndarray, edges: MeshEdges, positions: mi.Float, triangles: mi.UInt32, cameras: FilmCameras
 ) -> Outline:
-    """Cuts edges off at the camera's plane and at the picture's border; drops what is outside.
+    """Cuts edges off at the camera's plane and at the picture's border; drops what is outside, and concave folds.
+
+    All edges of all views are one wavefront, in double precision.
 
     Args:
         view: (S,) which camera an edge is a silhouette for.
-        pair: (S, 2) its vertices.
-        opposite: (S,) another vertex of a face beside it, which tells on which side of the edge the surface lies.
-        vertices: (V, 3) float32.
+        edges: (S) of the mesh; `half_b` tells in which folds the surface in front hides the edge.
+        positions, triangles: the mesh's flat vertices and faces, detached.
     """
-    parts = []
-    for number in range(cameras.count):
-        chosen = np.flatnonzero(view == number)
-        parts.append(_clip_view(number, pair[chosen], opposite[chosen], vertices, cameras))
-    return Outline(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    if not len(view):
+        return Outline(*(np.zeros((0, *shape), dtype) for shape, dtype in _FIELDS))
+    number, half = upload_indices(view), upload_indices(edges.half_a)
+    beside, is_border = upload_indices(np.maximum(edges.half_b, 0)), mi.Bool(edges.half_b < 0)
+    right, up, back, eye, half_width = cameras.exactly(number)
 
+    def seen(corner: mi.UInt32) -> mi.Vector3d:
+        """The corner in camera space: x to the right, y up, z to the viewer."""
+        offset = mi.Vector3d(dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, triangles, corner))) - eye
+        return mi.Vector3d(dr.dot(right, offset), dr.dot(up, offset), dr.dot(back, offset))
 
-def _clip_view(
-    number: int, pair: np.ndarray, opposite: np.ndarray, vertices: np.ndarray, cameras: FilmCameras
-) -> tuple[np.ndarray, ...]:
-    """The fields of `Outline` for one camera. Coordinates are rows here, x, y and z: NumPy is faster that way."""
+    next_corner, third_corner = _neighbours(half)
+    first, second, third, fourth = map(seen, (half, next_corner, third_corner, _neighbours(beside)[1]))
+    keep = is_border | (dr.dot(dr.cross(second - first, third - first), fourth - first) < 0)
 
-    def camera_space(index: np.ndarray) -> np.ndarray:
-        return cameras.axes[number] @ (vertices[index] - cameras.position[number]).T
-
-    first, second, third = camera_space(pair[:, 0]), camera_space(pair[:, 1]), camera_space(opposite)
-    first_depth, second_depth = -first[2], -second[2]
+    first_depth, second_depth = -first.z, -second.z
     rise = second_depth - first_depth
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cut = np.where(rise != 0, (_NEAREST_DEPTH - first_depth) / rise, 0.0)
-    low = np.where(first_depth < _NEAREST_DEPTH, cut, 0.0)
-    high = np.where(second_depth < _NEAREST_DEPTH, cut, 1.0)
-    alive = np.maximum(first_depth, second_depth) > _NEAREST_DEPTH
-    edge = second - first
-    near, far = first + low * edge, first + high * edge
-    centre, scale = 0.5 * cameras.size, 0.5 * cameras.size / cameras.half_width[number]
+    cut = dr.select(rise != 0, (_NEAREST_DEPTH - first_depth) / rise, 0)
+    low = dr.select(first_depth < _NEAREST_DEPTH, cut, 0)
+    high = dr.select(second_depth < _NEAREST_DEPTH, cut, 1)
+    keep &= dr.maximum(first_depth, second_depth) > _NEAREST_DEPTH
+    near, far = dr.fma(low, second - first, first), dr.fma(high, second - first, first)
+    centre, scale = 0.5 * cameras.size, 0.5 * cameras.size / half_width
 
-    def project(point: np.ndarray) -> np.ndarray:
-        per_depth = scale / np.maximum(-point[2], 0.5 * _NEAREST_DEPTH)
-        return np.stack([centre + point[0] * per_depth, centre - point[1] * per_depth])
+    def project(point: mi.Vector3d) -> tuple[mi.Float64, mi.Float64]:
+        per_depth = scale / dr.maximum(-point.z, 0.5 * _NEAREST_DEPTH)
+        return centre + point.x * per_depth, centre - point.y * per_depth
 
     start, end = project(near), project(far)
-    enter, leave = np.zeros(len(pair)), np.ones(len(pair))
-    for begin, step in zip(start, end - start, strict=True):
+    enter, leave = mi.Float64(0), mi.Float64(1)
+    for begin, step in zip(start, _minus(end, start), strict=True):
         # The picture's two pairs of borders, each a range of the edge's parameter on the film.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one, other = -begin / step, (cameras.size - begin) / step
-        level = step == 0
-        enter = np.where(level, enter, np.maximum(enter, np.minimum(one, other)))
-        leave = np.where(level, leave, np.minimum(leave, np.maximum(one, other)))
-        alive &= ~level | ((begin >= 0) & (begin <= cameras.size))
+        level, one, other = step == 0, -begin / step, (cameras.size - begin) / step
+        enter = dr.select(level, enter, dr.maximum(enter, dr.minimum(one, other)))
+        leave = dr.select(level, leave, dr.minimum(leave, dr.maximum(one, other)))
+        keep &= ~level | ((begin >= 0) & (begin <= cameras.size))
     # Across the plane through the camera and the edge; its gradient on the film points to the positive side.
-    plane = np.stack([first[k - 2] * second[k - 1] - first[k - 1] * second[k - 2] for k in range(3)])
-    side = np.sign(plane[0] * third[0] + plane[1] * third[1] + plane[2] * third[2])
-    size = np.sqrt(plane[0] ** 2 + plane[1] ** 2)
-    keep = np.flatnonzero(alive & (leave > enter) & (size > 0) & (side != 0))
+    plane = dr.cross(first, second)
+    side, size = dr.dot(plane, third), dr.sqrt(dr.square(plane.x) + dr.square(plane.y))
+    keep &= (leave > enter) & (size > 0) & (side != 0)
     # Neighbours on the film become neighbours in the list: rays through the same part of the scene are traced together.
-    tile = np.clip(start[:, keep] / _TILE, -1, cameras.size).astype(np.int64)
-    keep = keep[np.argsort(tile[1] * (cameras.size + 2) + tile[0], kind="stable")]
-    start, step, enter, leave = start[:, keep], (end - start)[:, keep], enter[keep], leave[keep]
-    depth_near, depth_far, low, span = -near[2, keep], -far[2, keep], low[keep], (high - low)[keep]
+    column, row = (mi.UInt32(dr.clip(place / _TILE + 1, 0, cameras.size + 1)) for place in start)
+    tile = (number * (cameras.size + 2) + row) * (cameras.size + 2) + column
 
-    def along(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    depth_near, depth_far = -near.z, -far.z
+
+    def along(s: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
         t = s * depth_near / (depth_far * (1 - s) + depth_near * s)
-        return low + t * span, depth_near + t * (depth_far - depth_near)
+        return low + t * (high - low), depth_near + t * (depth_far - depth_near)
 
     (along_0, depth_0), (along_1, depth_1) = along(enter), along(leave)
-    outwards = np.stack([plane[0, keep], -plane[1, keep]], axis=1) * (-side[keep] / size[keep])[:, None]
-    return (
-        np.full(len(keep), number, dtype=np.int64),
-        pair[keep],
-        np.stack([(start + enter * step).T, (start + leave * step).T], axis=1),
-        np.stack([depth_0, depth_1], axis=1),
-        np.stack([along_0, along_1], axis=1),
-        outwards,
+    film = [
+        dr.fma(place, step, begin)
+        for place in (enter, leave)
+        for begin, step in zip(start, _minus(end, start), strict=True)
+    ]
+    away = dr.select(side > 0, -1, 1) / size
+    numbers = [*film, depth_0, depth_1, along_0, along_1, plane.x * away, -plane.y * away]
+    vertices = [dr.gather(mi.UInt32, triangles, corner) for corner in (half, next_corner)]
+    dr.eval(keep, tile, numbers, vertices)
+    kept = np.flatnonzero(np.array(keep))
+    kept = kept[np.argsort(np.array(tile)[kept], kind="stable")]
+    columns = np.stack([np.array(column)[kept] for column in numbers], axis=1)
+    return Outline(
+        view[kept],
+        np.stack([np.array(column)[kept] for column in vertices], axis=1).astype(np.int64),
+        columns[:, :4].reshape(-1, 2, 2),
+        *(columns[:, k : k + 2] for k in (4, 6, 8)),
     )
+
+
+def _neighbours(corner: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """The next and the previous corner of the same face."""
+    place = corner % 3
+    return dr.select(place == 2, corner - 2, corner + 1), dr.select(place == 0, corner + 2, corner - 1)
+
+
+def _minus(a: tuple[mi.Float64, mi.Float64], b: tuple[mi.Float64, mi.Float64]) -> tuple[mi.Float64, mi.Float64]:
+    return a[0] - b[0], a[1] - b[1]

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.mesh_edges import MeshEdges, check_welded, corners, pair_closed, pair_half_edges
+from fd_mitsuba.render.mesh_edges import MeshEdges, check_welded, pair_closed, pair_half_edges
 from fd_mitsuba.render.outline import Outline, clip_outline
 from fd_mitsuba.render.upload import upload_floats
 
@@ -16,32 +16,31 @@ _VIEWS_AT_ONCE = 32
 
 
 def find_outline(
-    vertices: np.ndarray, faces: np.ndarray, cameras: FilmCameras, uploaded: tuple[mi.Float, mi.UInt32], closed: bool
+    faces: np.ndarray, cameras: FilmCameras, uploaded: tuple[mi.Float, mi.UInt32], closed: bool
 ) -> Outline:
     """The silhouette edges of all views, within the picture. Concave folds are left out: the surface hides them.
 
     Args:
-        vertices: (V, 3) float32.
         faces: (F, 3) int64, welded, outward winding.
-        uploaded: flat vertices and faces in Dr.Jit, detached.
+        uploaded: flat vertices, and the same faces, in Dr.Jit, detached.
         closed: what `is_closed` says of them; True saves the search for boundaries.
 
     Raises:
         ValueError: vertices not welded, or winding not consistent.
     """
     positions, triangles = uploaded
-    every = None if closed else pair_half_edges(faces)
+    vertices, every = dr.width(positions) // 3, None if closed else pair_half_edges(faces)
     if every is not None:
         check_welded(faces, every)
     parts = [(np.zeros(0, np.int64),) * 3]
     for begin in range(0, cameras.count, _VIEWS_AT_ONCE):
         eyes = cameras.position[begin : begin + _VIEWS_AT_ONCE]
         facing = _facing(positions, triangles, eyes)
-        edges = every or pair_closed(faces, *_where_it_turns(facing, triangles, len(vertices)), len(vertices))
+        edges = every or pair_closed(faces, *_where_it_turns(facing, triangles, vertices), vertices)
         edge, view = _turning(np.array(facing), edges, len(eyes))
         parts.append((view + begin, edges.half_a[edge], edges.half_b[edge]))
     view, half_a, half_b = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return clip_outline(*_convex(vertices, faces, view, half_a, half_b), vertices, cameras)
+    return clip_outline(view, MeshEdges(half_a, half_b), positions, triangles, cameras)
 
 
 def _count(triangles: mi.UInt32) -> int:
@@ -97,16 +96,3 @@ def _turning(facing: np.ndarray, edges: MeshEdges, views: int) -> tuple[np.ndarr
     chosen = np.flatnonzero(differ)
     place, view = np.nonzero((differ[chosen, None] >> np.arange(views, dtype=np.uint32)) & 1)
     return chosen[place], view
-
-
-def _convex(
-    vertices: np.ndarray, faces: np.ndarray, view: np.ndarray, half_a: np.ndarray, half_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """View, vertices (S, 2) and the opposite vertex of one face, for edges that do not bend inwards."""
-    start, end, opposite = corners(faces, half_a)
-    _, _, other = corners(faces, np.maximum(half_b, 0))
-    begin = vertices[start].T.astype(np.float64)
-    along, a, b = (vertices[index].T - begin for index in (end, opposite, other))
-    bend = sum((along[k - 2] * a[k - 1] - along[k - 1] * a[k - 2]) * b[k] for k in range(3))
-    keep = np.flatnonzero((half_b < 0) | (bend < 0))
-    return view[keep], np.stack([start[keep], end[keep]], axis=1), opposite[keep]

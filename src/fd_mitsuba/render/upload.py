@@ -16,3 +16,8 @@ def upload_floats(values: np.ndarray) -> mi.Float:
 def upload_indices(values: np.ndarray) -> mi.UInt32:
     """A flat uint32 copy of non-negative integers."""
     return mi.UInt32(aligned(values, np.uint32))
+
+
+def upload_doubles(values: np.ndarray) -> mi.Float64:
+    """A flat float64 copy."""
+    return mi.Float64(aligned(values, np.float64))
