@@ -54,8 +54,8 @@ def clip_outline(
     """
     if not len(view):
         return Outline(*(np.zeros((0, *shape), dtype) for shape, dtype in _FIELDS))
-    number, half = upload_indices(view), upload_indices(edges.half_a)
-    beside, is_border = upload_indices(np.maximum(edges.half_b, 0)), mi.Bool(edges.half_b < 0)
+    number, half, beside = map(upload_indices, (view, edges.half_a, edges.half_b + 1))
+    is_border, beside = beside == 0, dr.maximum(beside, 1) - 1
     right, up, back, eye, half_width = cameras.exactly(number)
 
     def seen(corner: mi.UInt32) -> mi.Vector3d:
