@@ -192,7 +192,7 @@ class SurfaceExtractor:
         return self._at_active(self._part_at_sites(field)[2])
 
     def _at_active(self, sdf_at_sites: Tensor) -> Tensor:
-        return sdf_at_sites[self._box_site[self._box.local(self.active_index)].long()]
+        return sdf_at_sites.index_select(0, self._site_of_active)
 
     def _prepare_static(self) -> None:
         """What the base contributes whatever the part does: edges without, and cells without, an active end."""
@@ -217,6 +217,7 @@ class SurfaceExtractor:
             self._site_box = self._box.local(self._sites.index)
             self._box_site = torch.full((len(self._box.vertices),), -1, dtype=torch.int32)
             self._box_site[self._site_box] = torch.arange(len(self._sites), dtype=torch.int32)
+            self._site_of_active = self._box_site[self._box.local(self.active_index)].long()
         features = field.site_features(self._sites)
         return self._sites, features, field.site_sdf(features, self._site_initial)
 
