@@ -1,9 +1,9 @@
-"""Pictures for the evaluator: one view of a whole body, with a part, without one, or with a shapeless lump.
+"""Pictures for the evaluator: one view of a whole body, with a part, without one, or with the start of one.
 
 They are made by the prior's makers of bodies and parts but are not the prior's pictures: other seeds, single views of
 64 x 64 from all round, shapes stretched, parts turned, moved and bent. Each hit is drawn twice: as camera-space normals
-on black, (n + 1) / 2, as `training.sheets.normal_pictures`, and lit on grey, as `evaluation.lit_views`. The lump stands
-where a part would and is captioned as if it were not there: an ellipsoid that a run starts from is no part yet.
+on black, (n + 1) / 2, as `training.sheets.normal_pictures`, and lit on grey, as `evaluation.lit_views`. Ellipsoids that
+a run could start from stand where a part would, and are captioned as if they were not there: they are no part yet.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from fd_mitsuba.prior.corpus import RayCaster
 from fd_mitsuba.prior.light import Light, lit_by, random_environment, reflected
 from fd_mitsuba.prior.looks import NAMED, NATURAL, Material, random_body_look, zones
 from fd_mitsuba.prior.parts import PARTS
-from fd_mitsuba.prior.primitives import Solid, ellipsoid, rotation, transform
+from fd_mitsuba.prior.primitives import Solid, rotation, transform
+from fd_mitsuba.prior.starts import starts_like
 from fd_mitsuba.render.tonemap import to_srgb
 
 TRAINING_SEED, UNSEEN_SEED = 3 * 2**30, 7 * 2**29
@@ -85,7 +86,7 @@ class View:
 def make_pictures(
     body: str, parts: list[str], seed: int, cameras: list[View] | int = 5, parts_a_camera: int = 3
 ) -> list[JudgePicture]:
-    """Normal and lit pictures of one random body: plain, with each of some parts, with a lump.
+    """Normal and lit pictures of one random body: plain, with each of some parts, with a start.
 
     Args:
         cameras: given ones, each of which sees every part, or how many random ones, each of which sees some.
@@ -96,7 +97,6 @@ def make_pictures(
     solid = transform(made.solid, stretch)
     caster, light = RayCaster(solid), lit_by(random_environment(rng))
     grown = {name: transform(varied(PARTS[name](made, rng), rng), stretch) for name in parts}
-    lump = transform(_lump(list(grown.values()), rng), stretch) if parts else None
     casters = {name: (RayCaster(part), pieces_of(part)) for name, part in grown.items()}
     pictures = []
     for number, view in enumerate(cameras if isinstance(cameras, list) else [View.random(rng) for _ in range(cameras)]):
@@ -105,13 +105,14 @@ def make_pictures(
         for name in chosen:
             hits = visible(view.rays, base_hits, *casters[name])
             pictures += _draw(hits, view, body, str(name), solid, grown[name], light, rng)
-        if number != 1:
+        if number % 2 or not grown:
             plain = base_hits[0], base_hits[1], np.zeros(len(base_hits[0]), np.int64)
             hits = visible(view.rays, base_hits, _Nothing(), plain[2])
             pictures += _draw(hits, view, body, None, solid, None, light, rng)
-        elif lump is not None:
-            hits = visible(view.rays, base_hits, RayCaster(lump), np.zeros(len(lump.faces), np.int64))
-            pictures += _draw(hits, view, body, None, solid, lump, light, rng)
+        else:
+            start = transform(starts_like(list(grown.values())[rng.integers(len(grown))], rng), stretch)
+            hits = visible(view.rays, base_hits, RayCaster(start), np.zeros(len(start.faces), np.int64))
+            pictures += _draw(hits, view, body, None, solid, start, light, rng)
     return pictures
 
 
@@ -143,13 +144,6 @@ class _Nothing:
 
 def _aim(rng: np.random.Generator) -> np.ndarray:
     return np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.35), rng.uniform(-0.1, 0.1)])
-
-
-def _lump(parts: list[Solid], rng: np.random.Generator) -> Solid:
-    part = parts[rng.integers(len(parts))]
-    low, high = part.vertices.min(0), part.vertices.max(0)
-    half = np.clip((high - low) / 2 * rng.uniform(0.6, 1.1, 3), 0.08, 0.7)
-    return ellipsoid((low + high) / 2, half, rotation(*rng.uniform(-20, 20, 3)))
 
 
 def _draw(

@@ -82,7 +82,7 @@ def retrieval(
         pictures = [p for p in pictures if (p.shown.body_style != ANY_STYLE) == lit]
         pixels = torch.from_numpy(np.stack([p.pixels for p in pictures])).permute(0, 3, 1, 2).float() / 255
         features, shown = judge.images(pixels), np.array([p.shown.part for p in pictures])
-        # The second camera shows a lump instead of the plain body; both count as without a part.
+        # Every other camera shows ellipsoids instead of the plain body; both count as without a part.
         bare = cosines(features[shown == NO_PART], torch.cat([plain[b : b + 1], texts[b]]))
         for part in parts:
             p = _PART_NAMES.index(part)
