@@ -43,6 +43,21 @@ def test_no_more_samples_at_once_than_allowed() -> None:
     assert 2 < max(seen) <= 5
 
 
+def test_each_thread_works_alone_even_on_a_single_sample() -> None:
+    seen = []
+
+    def call(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        seen.append((torch.get_num_threads(), threading.current_thread() is threading.main_thread()))
+        return product(first, second)
+
+    one = tuple(whole[:1] for whole in INPUTS)
+    of_samples(call, one, 4, 2)
+    of_samples(call, INPUTS, 4, 2)
+    assert set(seen) == {(1, False)}
+    of_samples(call, one, 4, 1)
+    assert seen[-1] == (torch.get_num_threads(), True)
+
+
 def test_an_error_of_a_thread_reaches_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
         of_samples(lambda *_: 1 / 0, INPUTS, 4, 2)  # type: ignore[arg-type, return-value]
