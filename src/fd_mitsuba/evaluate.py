@@ -154,5 +154,6 @@ def _words(scene: EditScene) -> tuple[EditPrompt, str | None]:
 def _key(folder: Path, judge: Judge, protocol: Protocol, rivals: Sequence[ScenePrompts]) -> str:
     """Changes with whatever the result depends on."""
     digest = hashlib.sha256((folder / "metrics.json").read_bytes())
-    digest.update(repr((FORMAT, judge.name, protocol, [(rival.name, rival.words) for rival in rivals])).encode())
+    among = [(rival.name, rival.words) for rival in rivals]
+    digest.update(repr((FORMAT, judge.name, judge.version, protocol, among)).encode())
     return digest.hexdigest()[:16]

@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from fd_mitsuba.mitsuba_api import DEFAULT_VARIANT, start
@@ -67,13 +67,8 @@ def network_threads() -> Iterator[None]:
     """While open, torch uses all the cores given to `share_cores`; without that call nothing changes."""
     import torch
 
-    before = torch.get_num_threads()
-    if _cores is not None:
-        torch.set_num_threads(_cores)
-    try:
+    with _all_cores(torch.get_num_threads, torch.set_num_threads):
         yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager
@@ -85,13 +80,19 @@ def rendering_threads() -> Iterator[None]:
     """
     import drjit as dr
 
-    before = dr.thread_count()
+    with _all_cores(dr.thread_count, dr.set_thread_count):
+        yield
+
+
+@contextmanager
+def _all_cores(count: Callable[[], int], change: Callable[[int], None]) -> Iterator[None]:
+    before = count()
     if _cores is not None:
-        dr.set_thread_count(_cores)
+        change(_cores)
     try:
         yield
     finally:
-        dr.set_thread_count(before)
+        change(before)
 
 
 def _keep_freed_memory() -> None:

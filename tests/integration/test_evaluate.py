@@ -52,6 +52,7 @@ class Average:
     """Sees a picture as its mean colour, and a sentence as a colour that depends on its length."""
 
     name = "mean colour"
+    version = "1"
     geometry_pictures = "normals"
 
     def images(self, pictures: torch.Tensor) -> torch.Tensor:

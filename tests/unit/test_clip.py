@@ -149,3 +149,11 @@ def test_the_built_in_evaluator_loads_without_a_network(monkeypatch: pytest.Monk
         plain.config.text_config.eos_token_id
         == AutoTokenizer.from_pretrained(clip_loading.EVALUATOR_FOLDER).eos_token_id
     )
+
+
+def test_the_version_follows_the_weights() -> None:
+    judge = ClipJudge.load()
+    assert judge.version == ClipJudge.load().version
+    judge._model.logit_scale.data += 1e-3
+    again = ClipJudge(judge._model, judge._tokenizer, judge._prepare, judge.name)
+    assert again.version != judge.version

@@ -105,6 +105,7 @@ class HandMade:
     """Two dimensions: pictures lie along their mean red and green, sentences where the test puts them."""
 
     name = "hand made"
+    version = "1"
     geometry_pictures = "normals"
 
     def __init__(self, **places: tuple[float, float]) -> None:

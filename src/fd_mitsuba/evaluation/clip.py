@@ -6,6 +6,7 @@ paper's). Figures of different models cannot be compared, so whoever reports one
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -48,6 +49,7 @@ class ClipJudge:
 
     Attributes:
         name: what to write beside a figure: `built-in evaluator`, or the folder or hub id.
+        version: changes with the weights, so that figures of a retrained model are not taken for the old one's.
         geometry_pictures: what this model wants to see of a shape without colours: camera-space normals as colours
             (n + 1) / 2 on black, or something shaded, as any CLIP of photographs does.
     """
@@ -62,6 +64,7 @@ class ClipJudge:
         whole_words: bool = False,
     ) -> None:
         self.name, self.geometry_pictures = name, geometry_pictures
+        self.version = _version(model)
         self._model, self._tokenizer, self._prepare = model.eval().requires_grad_(False), tokenizer, preprocessing
         self._whole_words = whole_words
 
@@ -138,6 +141,15 @@ def clip_direction(image_after: Tensor, image_before: Tensor, text_after: Tensor
     image = normalize(image_after, dim=-1) - normalize(image_before, dim=-1)
     text = (normalize(text_after, dim=-1) - normalize(text_before, dim=-1)).reshape(1, -1)
     return ClipDirection(cosine_similarity(image, text, dim=-1), (image * text).sum(-1))
+
+
+def _version(model: torch.nn.Module) -> str:
+    """A digest of the small tensors, such as norms and biases: any training changes them, and they are soon read."""
+    digest = hashlib.sha256()
+    for tensor in model.state_dict().values():
+        if tensor.numel() < 1 << 16:
+            digest.update(tensor.float().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _pooled(output: Any) -> Tensor:

@@ -16,6 +16,8 @@ class Judge(Protocol):
     """A model that puts pictures and sentences into one space; `evaluation.clip.ClipJudge`."""
 
     name: str
+    version: str
+    """Of its weights."""
     geometry_pictures: str
     """What it wants to see of a shape without colours: `normals` or `shaded`."""
 

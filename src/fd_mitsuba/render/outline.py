@@ -63,8 +63,8 @@ def clip_outline(
         offset = mi.Vector3d(dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, triangles, corner))) - eye
         return mi.Vector3d(dr.dot(right, offset), dr.dot(up, offset), dr.dot(back, offset))
 
-    next_corner, third_corner = _neighbours(half)
-    first, second, third, fourth = map(seen, (half, next_corner, third_corner, _neighbours(beside)[1]))
+    next_corner, third_corner = neighbours(half)
+    first, second, third, fourth = map(seen, (half, next_corner, third_corner, neighbours(beside)[1]))
     keep = is_border | (dr.dot(dr.cross(second - first, third - first), fourth - first) < 0)
 
     first_depth, second_depth = -first.z, -second.z
@@ -81,8 +81,9 @@ def clip_outline(
         return centre + point.x * per_depth, centre - point.y * per_depth
 
     start, end = project(near), project(far)
+    steps = end[0] - start[0], end[1] - start[1]
     enter, leave = mi.Float64(0), mi.Float64(1)
-    for begin, step in zip(start, _minus(end, start), strict=True):
+    for begin, step in zip(start, steps, strict=True):
         # The picture's two pairs of borders, each a range of the edge's parameter on the film.
         level, one, other = step == 0, -begin / step, (cameras.size - begin) / step
         enter = dr.select(level, enter, dr.maximum(enter, dr.minimum(one, other)))
@@ -103,11 +104,7 @@ def clip_outline(
         return low + t * (high - low), depth_near + t * (depth_far - depth_near)
 
     (along_0, depth_0), (along_1, depth_1) = along(enter), along(leave)
-    film = [
-        dr.fma(place, step, begin)
-        for place in (enter, leave)
-        for begin, step in zip(start, _minus(end, start), strict=True)
-    ]
+    film = [dr.fma(s, step, begin) for s in (enter, leave) for begin, step in zip(start, steps, strict=True)]
     away = dr.select(side > 0, -1, 1) / size
     numbers = [*film, depth_0, depth_1, along_0, along_1, plane.x * away, -plane.y * away]
     vertices = [dr.gather(mi.UInt32, triangles, corner) for corner in (half, next_corner)]
@@ -123,11 +120,7 @@ def clip_outline(
     )
 
 
-def _neighbours(corner: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+def neighbours(corner: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
     """The next and the previous corner of the same face."""
     place = corner % 3
     return dr.select(place == 2, corner - 2, corner + 1), dr.select(place == 0, corner + 2, corner - 1)
-
-
-def _minus(a: tuple[mi.Float64, mi.Float64], b: tuple[mi.Float64, mi.Float64]) -> tuple[mi.Float64, mi.Float64]:
-    return a[0] - b[0], a[1] - b[1]

@@ -8,7 +8,7 @@ import numpy as np
 
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.mesh_edges import MeshEdges, check_welded, pair_closed, pair_half_edges
-from fd_mitsuba.render.outline import Outline, clip_outline
+from fd_mitsuba.render.outline import Outline, clip_outline, neighbours
 from fd_mitsuba.render.upload import upload_floats
 
 _VIEWS_AT_ONCE = 32
@@ -79,10 +79,9 @@ def _where_it_turns(facing: mi.UInt32, triangles: mi.UInt32, vertices: int) -> t
     if not dr.width(face):
         return (np.zeros(0, np.int32),) * 3
     lane = dr.arange(mi.UInt32, 3 * dr.width(face))
-    corner = lane % 3
-    half = 3 * dr.gather(mi.UInt32, face, lane // 3) + corner
+    half = 3 * dr.gather(mi.UInt32, face, lane // 3) + lane % 3
     start = dr.gather(mi.UInt32, triangles, half)
-    end = dr.gather(mi.UInt32, triangles, dr.select(corner == 2, half - 2, half + 1))
+    end = dr.gather(mi.UInt32, triangles, neighbours(half)[0])
     lanes = dr.compress((dr.gather(mi.UInt32, turns, start) & dr.gather(mi.UInt32, turns, end)) != 0)
     chosen = [dr.gather(mi.UInt32, column, lanes) for column in (half, start, end)]
     dr.eval(chosen)
