@@ -67,10 +67,7 @@ def test_the_seed_decides_the_start_and_leaves_the_global_state_alone():
 
 def every_column(sites: LatticeSites, grid: HashGrid) -> torch.Tensor:
     features = sites.features(grid.table)
-    columns = features.columns(torch.arange(len(sites)))
-    for row in range(grid.width):
-        assert torch.equal(features.apply(lambda piece, row=row: piece[row], 50), columns[row])
-    return columns
+    return features.columns(torch.arange(len(sites)))
 
 
 @pytest.mark.parametrize("resolution", [10, 24, 40])
@@ -115,4 +112,3 @@ def test_no_sites_give_no_features():
     grid, lattice = make_grid(), TetGrid(4)
     sites = LatticeSites(grid, lattice.axis, torch.empty(0, dtype=torch.int64))
     assert every_column(sites, grid).shape == (grid.width, 0)
-    assert len(sites.features(grid.table).apply(lambda piece: piece[0], 16)) == 0

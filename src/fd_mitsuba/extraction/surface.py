@@ -3,8 +3,8 @@
 Only *active* vertices of the grid, those near the focal regions, know the part; elsewhere `sdf_part` is the constant
 `FAR_OUTSIDE`, so the union there is the base, exactly, and its triangles are extracted once. A step then
 
-1. evaluates `sdf_part` at all active vertices without gradients, for the signs and with them the topology;
-2. evaluates it again, with gradients, at the ends of crossed edges and at the caller's samples, which are the only
+1. finds the signs at all active vertices, without gradients, and with them the topology (`site_signs`);
+2. evaluates `sdf_part`, with gradients, at the ends of crossed edges and at the caller's samples, which are the only
    vertices that a loss can reach;
 3. joins the result with the base's triangles into one welded mesh.
 
@@ -28,6 +28,7 @@ from fd_mitsuba.extraction.marching_tets import (
     edge_ends,
     true_positions,
 )
+from fd_mitsuba.extraction.site_signs import SiteSigns
 from fd_mitsuba.extraction.tet_grid import EDGE_SLOTS, TetGrid
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.part_sdf import PartField, PartValues
@@ -72,6 +73,7 @@ class SurfaceExtractor:
         union_k: width of the fillet, canonical units; 0: none.
         union_only_outside: see `soft_union`.
         seam_width: w of `part_weight`, canonical units; None: one spacing.
+        depth: what callers that choose samples by the part's depth compare with, canonical units; None: no such ones.
 
     Attributes:
         active_index: (A,) int64 ascending.
@@ -89,6 +91,7 @@ class SurfaceExtractor:
         union_k: float = 0.15,
         union_only_outside: bool = False,
         seam_width: float | None = None,
+        depth: float | None = None,
     ) -> None:
         self.grid = grid
         self.sdf_base = sdf_base.detach()
@@ -97,6 +100,7 @@ class SurfaceExtractor:
         self.union_k = union_k
         self.union_only_outside = union_only_outside
         self.seam_width = grid.spacing if seam_width is None else seam_width
+        self._depth = depth
         self._shape = (grid.side,) * 3
         self.movable = away_from_crossings(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
         self._reach = _OFFSET_CELLS * grid.spacing * self._mark(self.active_index[self.movable]).to(sdf_base.dtype)
@@ -117,13 +121,13 @@ class SurfaceExtractor:
         Args:
             field: the part; all calls must use the same hash grid layout.
             samples: (S,) active vertices, in any order, repeats allowed, at which `sample_sdf` is wanted; or a function
-                that chooses them by the part's sdf (A,) at `active_index`, as `part_sdf` gives it.
+                that chooses them by whether (A,) the part is deeper than `depth` at `active_index`.
         """
-        sites, features, sdf_part = self._part_at_sites(field)
+        sites, features = self._site_features(field)
+        changed = self._signs.update(field, features)
         if callable(samples):
-            samples = samples(self._at_active(sdf_part))
-        union = soft_union(self._site_base, sdf_part, self.union_k, self.union_only_outside)
-        edges, faces = self._crossings(union > 0)
+            samples = samples(self._at_active(self._signs.deeper))
+        edges, faces = self._crossings(changed)
         lower, upper = edge_ends(edges, self._box.shape)
         is_fixed = (self._box_site.index_select(0, lower) < 0) & (self._box_site.index_select(0, upper) < 0)
         fixed, free = true_positions(is_fixed), true_positions(~is_fixed)
@@ -155,7 +159,7 @@ class SurfaceExtractor:
     @torch.no_grad()
     def lattice_values(self, field: PartField) -> tuple[Tensor, Tensor]:
         """`sdf_part` (count,), `FAR_OUTSIDE` where there is none, and the moved vertices (count, 3); no gradients."""
-        sites, features, _ = self._part_at_sites(field)
+        sites, features = self._site_features(field)
         values = field.site_values(sites, features, torch.arange(len(sites)), self._site_initial)
         sdf = self.sdf_base.new_full((self.grid.count,), FAR_OUTSIDE)
         sdf[sites.index] = values.sdf
@@ -189,10 +193,11 @@ class SurfaceExtractor:
     @torch.no_grad()
     def part_sdf(self, field: PartField) -> Tensor:
         """`sdf_part` (A,) at `active_index`, without gradients."""
-        return self._at_active(self._part_at_sites(field)[2])
+        sites, features = self._site_features(field)
+        return self._at_active(field.site_sdf(features, torch.arange(len(sites)), self._site_initial))
 
-    def _at_active(self, sdf_at_sites: Tensor) -> Tensor:
-        return sdf_at_sites.index_select(0, self._site_of_active)
+    def _at_active(self, at_sites: Tensor) -> Tensor:
+        return at_sites.index_select(0, self._site_of_active)
 
     def _prepare_static(self) -> None:
         """What the base contributes whatever the part does: edges without, and cells without, an active end."""
@@ -209,25 +214,28 @@ class SurfaceExtractor:
         self._static_faces = torch.searchsorted(self._static_edges, cell_edges)[faces]
         self._static_is_part = torch.zeros(len(faces), dtype=torch.bool)
 
-    def _part_at_sites(self, field: PartField) -> tuple[LatticeSites, SiteFeatures, Tensor]:
+    def _site_features(self, field: PartField) -> tuple[LatticeSites, SiteFeatures]:
         if self._sites is None:
             self._sites = field.sites(self.grid.axis, self.active_index)
-            self._site_base = self.sdf_base[self._sites.index]
             self._site_initial = self.initial_sdf[self._sites.index]
             self._site_box = self._box.local(self._sites.index)
             self._box_site = torch.full((len(self._box.vertices),), -1, dtype=torch.int32)
             self._box_site[self._site_box] = torch.arange(len(self._sites), dtype=torch.int32)
             self._site_of_active = self._box_site[self._box.local(self.active_index)].long()
-        features = field.site_features(self._sites)
-        return self._sites, features, field.site_sdf(features, self._site_initial)
+            base = self.sdf_base[self._sites.index]
+            self._signs = SiteSigns(base, self._site_initial, self.union_k, self.union_only_outside, self._depth)
+        return self._sites, field.site_features(self._sites)
 
-    def _crossings(self, inside_at_sites: Tensor) -> tuple[Tensor, Tensor]:
-        """The crossed edges, in the box's numbers, and the faces of its cells that touch a site."""
-        if len(inside_at_sites) == 0:
+    def _crossings(self, changed: Tensor) -> tuple[Tensor, Tensor]:
+        """The crossed edges, in the box's numbers, and the faces of its cells that touch a site.
+
+        Args:
+            changed: (N,) the sites whose signs may be others than at the last call.
+        """
+        if len(self._site_box) == 0:
             return self._static_edges[:0], self._static_faces[:0]
-        inside = self._box_inside.clone()
-        inside.numpy().reshape(-1)[self._site_box.numpy()] = inside_at_sites.numpy()  # three times as fast as torch
-        return crossing_faces(inside, self._box_cells, self._lookup)
+        self._box_inside.view(-1)[self._site_box[changed]] = self._signs.inside[changed]
+        return crossing_faces(self._box_inside, self._box_cells, self._lookup)
 
     def _values_with_gradient(
         self, field: PartField, sites: LatticeSites, features: SiteFeatures, ends: Tensor, samples: Tensor | None

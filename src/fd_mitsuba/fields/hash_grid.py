@@ -84,6 +84,11 @@ class HashGrid(nn.Module):
         cell = scaled.detach().floor().clamp(max=resolution - 1)
         return cell.long(), scaled - cell
 
+    def largest(self, table: Tensor) -> Tensor:
+        """The largest magnitude (levels * features,) of each feature in a table of this layout: no point has more."""
+        levels = table.split(self.rows, dim=1)
+        return torch.cat([level.abs().amax(dim=1) for level in levels])  # ten times as fast as the maximum norm
+
     def forward(self, positions: Tensor) -> Tensor:
         """The features (N, levels * features) at canonical positions (N, 3), level after level.
 

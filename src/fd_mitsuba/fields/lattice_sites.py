@@ -15,7 +15,7 @@ Gradients of vertices that share a row are added one after another in a fixed or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -74,7 +74,7 @@ class _Box:
 class SiteFeatures:
     """The features of all sites for one state of the table, as they come out: whole columns of the slabs.
 
-    Copying them into the order of the sites takes as long as half a perceptron, and few are wanted twice.
+    Copying them into the order of the sites takes as long as half a perceptron, and few are wanted at all.
 
     Attributes:
         none: (width, 0).
@@ -83,19 +83,6 @@ class SiteFeatures:
 
     none: Tensor
     slabs: list[tuple[Tensor, Tensor]]
-
-    def apply(self, function: Callable[[Tensor], Tensor], size: int) -> Tensor:
-        """`function` of the features of all sites, (A,) in the order of `LatticeSites.index`.
-
-        Args:
-            function: takes any N columns of features (width, N), N at most `size`, and returns (N,). It also sees the
-                places without a site: leaving them out costs more than they do.
-        """
-        outputs = [self.none[0]]
-        for full, inside in self.slabs:
-            of_slab = torch.cat([function(piece) for piece in full.split(size, dim=1)])
-            outputs.append(of_slab.index_select(0, inside))
-        return torch.cat(outputs)
 
     def columns(self, chosen: Tensor) -> Tensor:
         """Those of the sites `chosen` (S,), ascending: (width, S)."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
@@ -20,8 +21,8 @@ from fd_mitsuba.fields.hash_grid import HashGrid
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.mlp import ColumnMlp
 
-_PIECE = 16384
-"""Points at once, so that the perceptron's inputs and outputs stay in the processor's cache."""
+_PIECE = 1024
+"""Columns in every product of `site_sdf`, so that a site's value has the same bits whoever else is asked for."""
 
 
 class PartValues(NamedTuple):
@@ -76,9 +77,12 @@ class PartField(nn.Module):
         """The features at all sites, without gradients."""
         return sites.features(self.grid.table)
 
-    def site_sdf(self, features: SiteFeatures, initial_sdf: Tensor) -> Tensor:
-        """`sdf_part` (A,) at all sites from their features, without gradients."""
-        return initial_sdf + features.apply(self.mlp.first_output, _PIECE)
+    @torch.no_grad()
+    def site_sdf(self, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor) -> Tensor:
+        """`sdf_part` (S,) at some sites, without gradients; the arguments are those of `site_values`."""
+        columns = pad(features.columns(chosen), (0, -len(chosen) % _PIECE))
+        rows = torch.cat([self.mlp.first_output(piece) for piece in columns.split(_PIECE, dim=1)])
+        return initial_sdf + rows[: len(chosen)]
 
     def site_values(
         self, sites: LatticeSites, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor

@@ -33,7 +33,7 @@ from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.sheets import geometry_sheet
 from fd_mitsuba.training.step_views import check_views, step_views
-from fd_mitsuba.training.tethers import Tethers
+from fd_mitsuba.training.tethers import THIN, Tethers
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
@@ -93,7 +93,7 @@ class GeometryStage:
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.tethers: Tethers | None = None
-        if geometry.lambda_tether > 0 and not scene.subtracts:
+        if self._tethered:
             room = self.region_sdf > -geometry.focal_band
             self.tethers = Tethers(self.grid, self.sdf_base, room, self.extractor.active_index)
         self.base_surface = self._base_surface()
@@ -115,6 +115,10 @@ class GeometryStage:
     def lambda_collision(self) -> float:
         """The weight of L_CA; 0 where the part is cut out of the base, which it must enter."""
         return 0.0 if self.scene.subtracts else self.config.geometry.lambda_collision
+
+    @property
+    def _tethered(self) -> bool:
+        return self.config.geometry.lambda_tether > 0 and not self.scene.subtracts
 
     @property
     def coarse_steps(self) -> int:
@@ -238,7 +242,7 @@ class GeometryStage:
         tethers = self.tethers
         if samples is None or tethers is None:
             return samples
-        return lambda sdf_part: torch.cat([samples, tethers.find(sdf_part)])
+        return lambda deeper: torch.cat([samples, tethers.find(deeper)])
 
     def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
         return self._pass(self._passes, phase).render(
@@ -282,7 +286,10 @@ class GeometryStage:
     def _extractor(self, active: Tensor) -> SurfaceExtractor:
         geometry = self.config.geometry
         kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
-        return kind(self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside)
+        return kind(
+            self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside,
+            depth=THIN * self.grid.spacing if self._tethered else None,
+        )  # fmt: skip
 
     def _base_surface(self) -> UnionSurface:
         with torch.no_grad():

@@ -32,17 +32,21 @@ class Tethers:
     """
 
     def __init__(self, grid: TetGrid, sdf_base: Tensor, room: Tensor, active_index: Tensor) -> None:
-        self._box, self._thin = LatticeBox(grid, active_index), THIN * grid.spacing
+        self._box = LatticeBox(grid, active_index)
         self._place = self._box.local(active_index)
         self._base = self._box.cut(sdf_base > 0).numpy()
         reachable = torch.zeros(grid.count, dtype=torch.bool)
         reachable[active_index] = room[active_index]
         self._room = self._box.cut(reachable).numpy()
 
-    def find(self, sdf_part: Tensor) -> Tensor:
-        """The vertices (T,) int64 of `tether_vertices` for `sdf_part` (A,) at the active vertices. No gradients."""
+    def find(self, deeper: Tensor) -> Tensor:
+        """The vertices (T,) int64 of `tether_vertices`. No gradients.
+
+        Args:
+            deeper: (A,) bool, where the part is deeper than `THIN` cells, at the active vertices.
+        """
         part = torch.zeros(len(self._box.vertices), dtype=torch.bool)
-        part[self._place] = sdf_part > self._thin
+        part[self._place] = deeper
         found = tether_vertices(part.view(self._box.shape).numpy(), self._base, self._room)
         return self._box.vertices[torch.from_numpy(found)]
 
