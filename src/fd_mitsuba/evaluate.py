@@ -67,7 +67,8 @@ def evaluate_run(
     pictures of the bare shape were asked for; views are shown in `folder/images` under the same name.
 
     Args:
-        rivals: the scenes whose edit prompts the run's own has to be found among; see `ScenePrompts.rivals`.
+        rivals: the scenes whose edit prompts the run's own has to be found among. If the built-in models know every
+            word of the run's prompt, only the scenes of which that is true count.
         again: also if a result of the same run, judge, protocol and rivals is there already.
 
     Raises:
@@ -94,9 +95,8 @@ def evaluate_run(
             views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
     vocabulary = builtin_vocabulary()
     own, simple = _words(scene)
-    this = ScenePrompts(scene.path, own, simple)
-    known_to_builtin = vocabulary is not None and this.known_to(vocabulary)
-    among = this.rivals(rivals, vocabulary if known_to_builtin else None, coloured=appearance is not None)
+    known_to_builtin = vocabulary is not None and ScenePrompts(scene.path, own, simple).known_to(vocabulary)
+    among = [rival.words for rival in rivals if not known_to_builtin or rival.known_to(vocabulary)]
     result = {
         "format": FORMAT,
         "key": key,

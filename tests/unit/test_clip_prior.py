@@ -70,12 +70,14 @@ def test_pictures_are_the_seeds_and_in_pairs() -> None:
 
 
 def test_training_learns_resumes_and_packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fd_mitsuba.prior.clip_train.SHARDS", 1)
+    for name, value in (("SHARDS", 1), ("EVEN_SHARDS", 1), ("SETTLING", 0.25)):
+        monkeypatch.setattr(f"fd_mitsuba.prior.clip_train.{name}", value)
     monkeypatch.setattr("fd_mitsuba.prior.clip_train.SEEDS_A_SHARD", 2)
     for steps in (4, 8):
         train_evaluator(tmp_path / "run", 100, total_steps=steps, batch_size=12, data=tmp_path / "data", least_shards=1)
     state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
-    assert state["step"] == 8
+    assert state["step"] == 8 and state["began"] == 6
+    assert len(list((tmp_path / "data" / "even").glob("*.npz"))) == 1
     pack(tmp_path / "run" / "checkpoint.pt", tmp_path / "packed")
     judge = ClipJudge.load(str(tmp_path / "packed"))
     assert judge.geometry_pictures == "normals" and judge.texts(["a horse"]).isfinite().all()

@@ -16,7 +16,7 @@ from fd_mitsuba.evaluation.similarity import EditPrompt, Judge, clip_scores, ret
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.scene.edit_scene import EditScene
 
-FORMAT = 2
+FORMAT = 3
 
 
 def judged(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,25 +35,6 @@ class ScenePrompts:
         """Whether every word is known, and a body and a part among them."""
         reading = read_prompt(self.words.prompt, vocabulary)
         return bool(reading.parts and reading.bodies and not reading.ignored)
-
-    def rivals(self, others: Sequence[ScenePrompts], vocabulary: Vocabulary | None, coloured: bool) -> list[EditPrompt]:
-        """The edit prompts of other scenes that this one's has to be found among.
-
-        Args:
-            vocabulary: only prompts that it knows count; None: all.
-            coloured: whether the pictures show colours. If not, nobody can tell apart prompts for the same part on the
-                same body, "a horse with two wings" and "a wooden horse with two wooden wings": those do not count.
-        """
-        if vocabulary is None:
-            return [other.words for other in others]
-        known = [other for other in others if other.known_to(vocabulary)]
-        shape = self._shape(vocabulary)
-        return [other.words for other in known if coloured or other._shape(vocabulary) != shape]
-
-    def _shape(self, vocabulary: Vocabulary) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The body and the parts that the prompt asks for."""
-        reading = read_prompt(self.words.prompt, vocabulary)
-        return tuple(reading.bodies[:1]), tuple(reading.parts)
 
 
 def prompts_of_scenes(folder: Path) -> list[ScenePrompts]:

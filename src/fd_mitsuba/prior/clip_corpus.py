@@ -84,12 +84,14 @@ class View:
 
 
 def make_pictures(
-    body: str, parts: list[str], seed: int, cameras: list[View] | int = 5, parts_a_camera: int = 3
+    body: str, parts: list[str], seed: int, cameras: list[View] | int = 5, parts_a_camera: int = 3, even: bool = False
 ) -> list[JudgePicture]:
     """Normal and lit pictures of one random body: plain, with each of some parts, with a start.
 
     Args:
         cameras: given ones, each of which sees every part, or how many random ones, each of which sees some.
+        even: whether every camera sees the body plain and a start for each part that it sees, so that starts and parts
+            are equally many; otherwise a start in the first, third, … view and the plain body in the others.
         seed: with `body` and `parts` decides everything.
     """
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
@@ -105,22 +107,22 @@ def make_pictures(
         for name in chosen:
             hits = visible(view.rays, base_hits, *casters[name])
             pictures += _draw(hits, view, body, str(name), solid, grown[name], light, rng)
-        if number % 2 or not grown:
-            plain = base_hits[0], base_hits[1], np.zeros(len(base_hits[0]), np.int64)
-            hits = visible(view.rays, base_hits, _Nothing(), plain[2])
+            if even:
+                pictures += _draw_start(grown[name], base_hits, view, body, solid, stretch, light, rng)
+        if even or number % 2 or not grown:
+            hits = visible(view.rays, base_hits, _Nothing(), np.zeros(len(base_hits[0]), np.int64))
             pictures += _draw(hits, view, body, None, solid, None, light, rng)
         else:
-            start = transform(starts_like(list(grown.values())[rng.integers(len(grown))], rng), stretch)
-            hits = visible(view.rays, base_hits, RayCaster(start), np.zeros(len(start.faces), np.int64))
-            pictures += _draw(hits, view, body, None, solid, start, light, rng)
+            part = list(grown.values())[rng.integers(len(grown))]
+            pictures += _draw_start(part, base_hits, view, body, solid, stretch, light, rng)
     return pictures
 
 
-def random_pictures(seed: int) -> list[JudgePicture]:
-    """Pictures of the body and the parts that the seed draws."""
+def random_pictures(seed: int, even: bool = False) -> list[JudgePicture]:
+    """Pictures of the body and the parts that the seed draws; `even` as in `make_pictures`."""
     rng = np.random.default_rng([seed, 1000])
     parts = [str(name) for name in rng.permutation(list(PARTS))[:5]]
-    return make_pictures(str(rng.choice(list(BODIES))), parts, seed)
+    return make_pictures(str(rng.choice(list(BODIES))), parts, seed, even=even)
 
 
 def varied(part: Solid, rng: np.random.Generator) -> Solid:
@@ -144,6 +146,21 @@ class _Nothing:
 
 def _aim(rng: np.random.Generator) -> np.ndarray:
     return np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.35), rng.uniform(-0.1, 0.1)])
+
+
+def _draw_start(
+    part: Solid,
+    base_hits: tuple[np.ndarray, np.ndarray, np.ndarray],
+    view: View,
+    body: str,
+    solid: Solid,
+    stretch: np.ndarray,
+    light: Light,
+    rng: np.random.Generator,
+) -> list[JudgePicture]:
+    start = transform(starts_like(part, rng), stretch)
+    hits = visible(view.rays, base_hits, RayCaster(start), np.zeros(len(start.faces), np.int64))
+    return _draw(hits, view, body, None, solid, start, light, rng)
 
 
 def _draw(
@@ -215,13 +232,15 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
 
 
-def render_shards(folder: Path, first_seed: int, seeds: int, seeds_a_shard: int = 8) -> Iterator[Path]:
+def render_shards(
+    folder: Path, first_seed: int, seeds: int, seeds_a_shard: int = 8, even: bool = False
+) -> Iterator[Path]:
     """Write pictures as `folder/<seed>.npz`, one file for each `seeds_a_shard` seeds; files that are there are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for start in range(first_seed, first_seed + seeds, seeds_a_shard):
         path = folder / f"{start}.npz"
         if not path.is_file():
-            made = [p for seed in range(start, start + seeds_a_shard) for p in random_pictures(seed)]
+            made = [p for seed in range(start, start + seeds_a_shard) for p in random_pictures(seed, even)]
             arrays = {
                 "pixels": np.stack([p.pixels for p in made]),
                 "shown": np.array([p.shown for p in made], np.int8),
