@@ -49,8 +49,8 @@ class UnionSurface:
     Attributes:
         vertices: (V, 3) float32, canonical; gradients flow to the part's field.
         faces: (F, 3) int64.
-        part_weight: (V,) in [0, 1], 0 on the base and 1 on the part, `clamp(0.5 + (sdf_part - sdf_base) / (2 w))` at
-            the vertex; gradients flow. Unlike a label per face it moves continuously with the seam.
+        part_weight: (V,) in [0, 1], 0 on the base and 1 on the part, `clamp(0.5 + (sdf_part - sdf_base) / (2 spacing))`
+            at the vertex; gradients flow. Unlike a label per face it moves continuously with the seam.
         face_is_part: (F,) bool, whether the mean of a face's part_weight exceeds 0.5.
         sample_sdf: (S,) `sdf_part` at the samples that the caller asked for; gradients flow.
     """
@@ -72,7 +72,6 @@ class SurfaceExtractor:
         active_index: (A,) vertices at which the part exists (see `active_vertices`); border vertices are dropped.
         union_k: width of the fillet, canonical units; 0: none.
         union_only_outside: see `soft_union`.
-        seam_width: w of `part_weight`, canonical units; None: one spacing.
         depth: what callers that choose samples by the part's depth compare with, canonical units; None: no such ones.
 
     Attributes:
@@ -90,7 +89,6 @@ class SurfaceExtractor:
         active_index: Tensor,
         union_k: float = 0.15,
         union_only_outside: bool = False,
-        seam_width: float | None = None,
         depth: float | None = None,
     ) -> None:
         self.grid = grid
@@ -99,7 +97,6 @@ class SurfaceExtractor:
         self.active_index = active_index[~grid.is_border(active_index)].unique()
         self.union_k = union_k
         self.union_only_outside = union_only_outside
-        self.seam_width = grid.spacing if seam_width is None else seam_width
         self._depth = depth
         self._shape = (grid.side,) * 3
         self.movable = away_from_crossings(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
@@ -124,10 +121,9 @@ class SurfaceExtractor:
                 that chooses them by whether (A,) the part is deeper than `depth` at `active_index`.
         """
         sites, features = self._site_features(field)
-        changed = self._signs.update(field, features)
+        edges, faces = self._crossings(self._signs.update(field, features))
         if callable(samples):
             samples = samples(self._at_active(self._signs.deeper))
-        edges, faces = self._crossings(changed)
         lower, upper = edge_ends(edges, self._box.shape)
         is_fixed = (self._box_site.index_select(0, lower) < 0) & (self._box_site.index_select(0, upper) < 0)
         fixed, free = true_positions(is_fixed), true_positions(~is_fixed)
@@ -293,7 +289,7 @@ class SurfaceExtractor:
         vertices = start + fraction[:, None] * (positions.index_select(0, outer) - start)
         inner_lead, outer_lead = part_minus_base.index_select(0, inner), part_minus_base.index_select(0, outer)
         lead = inner_lead + fraction * (outer_lead - inner_lead)
-        return vertices, (0.5 + lead / (2 * self.seam_width)).clamp(0, 1)
+        return vertices, (0.5 + lead / (2 * self.grid.spacing)).clamp(0, 1)
 
 
 def _faces_of_part(part_weight: Tensor, faces: Tensor) -> Tensor:

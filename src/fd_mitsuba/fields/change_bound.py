@@ -18,8 +18,7 @@ class ChangeBound:
         sdf' - sdf = sum_j (w'_j - w_j) relu(W_j f) + w'_j (relu(W'_j f') - relu(W_j f)),
         |sdf' - sdf| <= sum_j |w'_j - w_j| (|W_j| |f|) + |w'_j| (|W'_j - W_j| |f| + |W'_j| |f' - f|).
 
-    Interpolation is a weighted mean of rows, so that no feature changes by more than the largest change of a row. An
-    optimiser's step moves the sdf by some tenths of a cell at most this way, and by a tenth of that in truth.
+    Interpolation is a weighted mean of rows, so that no feature changes by more than the largest change of a row.
     """
 
     def __init__(self) -> None:
