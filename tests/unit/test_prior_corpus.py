@@ -10,7 +10,7 @@ from fd_mitsuba.prior import corpus
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.corpus import MosaicCamera, RayCaster, make_pairs, shade
 from fd_mitsuba.prior.parts import FEET, PARTS, resized
-from fd_mitsuba.prior.primitives import Solid, box, join
+from fd_mitsuba.prior.primitives import Solid, box, join, transform
 from fd_mitsuba.scene.views import sample_views
 
 
@@ -64,11 +64,11 @@ def test_a_pair_differs_only_where_the_part_is() -> None:
     overview, closeup, nothing = make_pairs(name, [part, None], seed)
     assert np.array_equal(nothing.base, nothing.edited) and nothing.part is None
     random = np.random.default_rng([seed, list(BODIES).index(name)])
-    body = BODIES[name](random)
+    body, stretch = BODIES[name](random), corpus.random_stretch(random)
     camera = corpus.global_camera(random)
     assert camera.azimuth_deg == overview.azimuth_deg
     origins, directions, rotations = camera.rays()
-    solid = resized(part, PARTS[part](body, random), body, random)
+    solid = transform(resized(part, PARTS[part](body, random), body, random), stretch)
     seen = shade(*RayCaster(solid).cast(origins, directions), rotations)[3] > -127
     changed = (overview.base != overview.edited).any(0)
     assert changed.sum() > 20 and not (changed & ~seen).any()

@@ -15,7 +15,7 @@ from fd_mitsuba.mitsuba_api import start
 from fd_mitsuba.prior.bodies import BODIES
 from fd_mitsuba.prior.captions import caption, random_style, view_words
 from fd_mitsuba.prior.parts import PARTS, resized
-from fd_mitsuba.prior.primitives import Solid
+from fd_mitsuba.prior.primitives import Solid, transform
 
 VIEW_SIZE = 32
 SUPERSAMPLING = 2
@@ -24,6 +24,8 @@ LEAST_PIXELS = 12
 """Of a mosaic that a part must change to be seen at all."""
 STYLED_SHARE = 0.3
 """Captions that also name a colour or material, which normals do not show: the words must not disturb the shape."""
+STRETCH = 0.12
+"""Most that an object is longer or shorter along an axis, as a logarithm: people's meshes have other proportions."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +151,20 @@ def closeup_camera(part: Solid, rng: np.random.Generator) -> MosaicCamera:
     )
 
 
+def random_stretch(rng: np.random.Generator) -> np.ndarray:
+    """A diagonal matrix (3, 3) for body and part alike."""
+    return np.diag(np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
+
+
 def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
     """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
     made = BODIES[body](rng)
-    base_caster, overview, pairs = RayCaster(made.solid), global_camera(rng), []
+    stretch = random_stretch(rng)
+    base_caster, overview, pairs = RayCaster(transform(made.solid, stretch)), global_camera(rng), []
     overview_hits = None
     for part in parts:
-        solid = None if part is None else resized(part, PARTS[part](made, rng), made, rng)
+        solid = None if part is None else transform(resized(part, PARTS[part](made, rng), made, rng), stretch)
         caster = None if solid is None else RayCaster(solid)
         cameras = [(overview, False)] if solid is None else [(overview, False), (closeup_camera(solid, rng), True)]
         for camera, closeup in cameras:

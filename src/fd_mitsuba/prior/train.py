@@ -23,7 +23,7 @@ from fd_mitsuba.prior.replicas import Replicas
 from fd_mitsuba.prior.training_folder import TrainingFolder, follow, smoothed
 from fd_mitsuba.training.stop_request import stop_on_signals
 
-OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person")
+OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person", "rabbit", "cow", "vase")
 """Bodies that most pictures show; the others keep the copying of the base general."""
 _BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
 _BODY_SHARES /= _BODY_SHARES.sum()
