@@ -106,7 +106,7 @@ def test_the_presence_loss_leaves_no_region_empty(stage: Callable[..., GeometryS
     for step in range(60):
         shrinker.step(step)
     inside = shrinker.extractor.part_sdf(shrinker.field) > 0
-    room = shrinker.room[:, shrinker.extractor.active_index]
+    room = shrinker.field_losses.room[:, shrinker.extractor.active_index]
     assert all(0 < float(inside[row].float().mean()) < 0.5 for row in room)
 
 

@@ -16,29 +16,23 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
-from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
-from fd_mitsuba.losses.collision import loss_collision
-from fd_mitsuba.losses.focal import loss_focal
-from fd_mitsuba.losses.presence import loss_presence
-from fd_mitsuba.losses.tether import loss_tether
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.sheets import geometry_sheet
 from fd_mitsuba.training.step_views import check_views, step_views
-from fd_mitsuba.training.tethers import THIN, Tethers
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
-RIM_IN_CELLS = 2.0
-"""Within this distance of the base a part touches it: the soft union joins them."""
 EXPLODED_BEYOND = 1.0
 """A signed distance further than this from where it started, canonical units, is no shape any more."""
 
@@ -89,13 +83,11 @@ class GeometryStage:
         self.sdf_base = torch.from_numpy(base_sdf(points, base.vertices, base.faces))
         regions = torch.from_numpy(np.stack([region.sdf(points) for region in scene.regions]))
         self.region_sdf = regions.amax(dim=0)
-        self.room = self._room(regions > 0)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
-        self.tethers: Tethers | None = None
-        if self._tethered:
-            room = self.region_sdf > -geometry.focal_band
-            self.tethers = Tethers(self.grid, self.sdf_base, room, self.extractor.active_index)
+        self.field_losses = FieldLosses(
+            config, self.grid, self.sdf_base, regions, self.extractor.active_index, scene.subtracts
+        )
         self.base_surface = self._base_surface()
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, geometry)
@@ -110,15 +102,6 @@ class GeometryStage:
     def steps(self) -> int:
         """Steps of both phases together."""
         return self.config.geometry.steps
-
-    @property
-    def lambda_collision(self) -> float:
-        """The weight of L_CA; 0 where the part is cut out of the base, which it must enter."""
-        return 0.0 if self.scene.subtracts else self.config.geometry.lambda_collision
-
-    @property
-    def _tethered(self) -> bool:
-        return self.config.geometry.lambda_tether > 0 and not self.scene.subtracts
 
     @property
     def coarse_steps(self) -> int:
@@ -160,8 +143,8 @@ class GeometryStage:
         geometry = self.config.geometry
         phase, phase_step, phase_length = self.phase_of(step)
         cameras, closeup = self.cameras(step)
-        samples = self._samples(step)
-        surface = self.extractor(self.field, self._with_tethers(samples))
+        samples = self.field_losses.draw(step)
+        surface = self.extractor(self.field, self.field_losses.with_tethers(samples))
         losses: dict[str, Tensor] = {}
         values: dict[str, float] = {}
         pictures, preview = torch.zeros(0), None
@@ -175,9 +158,7 @@ class GeometryStage:
             values.update(result.logs)
             self._watch_visibility(pictures)
         if samples is not None:
-            losses.update(self._sample_losses(surface.sample_sdf[: len(samples)], samples))
-            if self.tethers is not None:
-                losses["tether"] = loss_tether(surface.sample_sdf[len(samples) :], self.grid.spacing)
+            losses.update(self.field_losses(surface.sample_sdf, samples))
         weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
@@ -203,46 +184,6 @@ class GeometryStage:
                 "guidance.guidance_scale"
             )
         return {"volume_ratio": inside}
-
-    def _sample_losses(self, sdf_part: Tensor, samples: Tensor) -> dict[str, Tensor]:
-        geometry, losses = self.config.geometry, {}
-        region = self.region_sdf[samples]
-        if geometry.lambda_focal > 0:
-            outside = region < 0
-            distance = (-region[outside] - geometry.focal_band).clamp(min=0)
-            losses["focal"] = loss_focal(
-                sdf_part[outside],
-                distance,
-                geometry.focal_sigma_distance,
-                geometry.focal_sigma_sdf,
-                geometry.focal_margin,
-            )
-        if self.lambda_collision > 0:
-            losses["collision"] = loss_collision(self.sdf_base[samples], sdf_part)
-        if geometry.lambda_volume > 0:
-            losses["volume"] = (0.5 + sdf_part / (2 * self.grid.spacing)).clamp(0, 1).mean()
-        if geometry.lambda_presence > 0:
-            depth = 0.5 * self.grid.spacing
-            losses["presence"] = loss_presence(sdf_part, self.room[:, samples], geometry.presence_share, depth)
-        return losses
-
-    def _samples(self, step: int) -> Tensor | None:
-        geometry = self.config.geometry
-        additions = (geometry.lambda_volume, geometry.lambda_presence, self.tethers is not None)
-        if not any((geometry.lambda_focal, self.lambda_collision, *additions)):
-            return None
-        index = self.extractor.active_index
-        if len(index) <= geometry.focal_samples:
-            return index
-        generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.SAMPLES, step))
-        return index[torch.randint(len(index), (geometry.focal_samples,), generator=generator)]
-
-    def _with_tethers(self, samples: Tensor | None) -> Samples | None:
-        """The samples, and after them the vertices between the object and loose pieces where their loss counts."""
-        tethers = self.tethers
-        if samples is None or tethers is None:
-            return samples
-        return lambda deeper: torch.cat([samples, tethers.find(deeper)])
 
     def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
         return self._pass(self._passes, phase).render(
@@ -276,19 +217,12 @@ class GeometryStage:
             passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
         return passes[phase]
 
-    def _room(self, inside: Tensor) -> Tensor:
-        """Vertices (., V) that must hold some of the part, a row each: a focal region, or its rim along the base."""
-        if self.scene.subtracts:
-            return inside
-        outside = inside & (self.sdf_base < 0)
-        return torch.cat([outside, outside & (self.sdf_base > -RIM_IN_CELLS * self.grid.spacing)])
-
     def _extractor(self, active: Tensor) -> SurfaceExtractor:
         geometry = self.config.geometry
         kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
         return kind(
             self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside,
-            depth=THIN * self.grid.spacing if self._tethered else None,
+            depth=tether_depth(geometry, self.grid, self.scene.subtracts),
         )  # fmt: skip
 
     def _base_surface(self) -> UnionSurface:
