@@ -21,7 +21,7 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
         "--kind", default="geometry", help="geometry (normals), appearance (colours) or evaluator (the metrics' CLIP)"
     )
     train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
-    train.add_argument("--steps", type=int, default=4000, help="length of the schedule")
+    train.add_argument("--steps", type=int, help="length of the schedule; default: what the kind takes to be good")
     train.add_argument("--hours", type=float, default=8.0, help="stop after this time at the latest")
     train.add_argument("--init", metavar="FOLDER", help="start from a packed prior instead of random weights")
     train.add_argument("--data", metavar="FOLDER", help="train on stored pairs of build-data instead of fresh ones")
@@ -122,16 +122,15 @@ def _prior_train(options: argparse.Namespace) -> int:
 
 
 def _evaluator_train(options: argparse.Namespace) -> int:
-    from fd_mitsuba.prior.clip_train import DATA, train_evaluator
+    from fd_mitsuba.prior.clip_train import DATA, STEPS, train_evaluator
     from fd_mitsuba.threads import network_threads
 
     if options.init:
         raise UserError("--init: an evaluator starts from random weights; leave it out")
     data = Path(options.data) if options.data else DATA
     with network_threads():
-        train_evaluator(
-            Path(options.output), options.hours * 3600, total_steps=options.steps, seed=options.seed, data=data
-        )
+        steps = STEPS if options.steps is None else options.steps
+        train_evaluator(Path(options.output), options.hours * 3600, total_steps=steps, seed=options.seed, data=data)
     print(f"{options.output}: checkpoint.pt and log.jsonl; {data}: its pictures")
     return 0
 

@@ -37,6 +37,8 @@ KEPT_PATCHES = 28
 ALL_PATCHES_FROM = 0.8
 """From this share of the training before it settles on, every patch is seen, as in use."""
 LEARNING_RATE = 1.2e-3
+STEPS = 12750
+"""Length of the schedule unless another is asked for."""
 SETTLING = 1 / 17
 """The last share of the training goes on from the averaged weights, at first at a quarter of the rate, with pictures
 that show as many starts as parts: of what could be either, neither is the better guess any more. A whole training of
@@ -141,7 +143,7 @@ def train_evaluator(
     folder: Path,
     seconds: float,
     *,
-    total_steps: int = 12750,
+    total_steps: int = STEPS,
     batch_size: int = 64,
     seed: int = 0,
     data: Path = DATA,

@@ -49,6 +49,7 @@ class Kind:
         tint_weight: extra loss weight of colour as against brightness, which four correlated channels share.
         time_power: t = 1000 u^time_power for uniform u; below 1 draws high noise more often.
         fresh_pairs: new training pairs a step.
+        steps: length of the schedule that makes such a prior from random weights.
         small_steps: first steps on pictures of half the size, a quarter of the cost: enough to learn what words mean.
         masked_noise: share of the pictures with noise on the part alone, as guidance with `mask_guidance` makes them.
         prediction: what the UNet says of a noisy picture, as Diffusers names it: `v_prediction`, or `sample`, the clean
@@ -69,6 +70,7 @@ class Kind:
     tint_weight: float
     time_power: float
     fresh_pairs: int
+    steps: int
     small_steps: int
     masked_noise: float
     prediction: str
@@ -105,6 +107,7 @@ GEOMETRY = Kind(
     tint_weight=0.0,
     time_power=0.75,
     fresh_pairs=4,
+    steps=16000,
     small_steps=1000,
     masked_noise=0.0,
     prediction="sample",
@@ -124,6 +127,7 @@ APPEARANCE = Kind(
     tint_weight=4.0,
     time_power=0.6,
     fresh_pairs=4,
+    steps=10000,
     small_steps=3500,
     masked_noise=0.9,
     prediction="sample",

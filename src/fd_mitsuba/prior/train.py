@@ -93,7 +93,7 @@ def train(
     *,
     kind: Kind = GEOMETRY,
     batch_size: int = 8,
-    total_steps: int = 5000,
+    total_steps: int | None = None,
     seed: int = 0,
     init: Path | None = None,
     pairs: Pairs | None = None,
@@ -104,10 +104,12 @@ def train(
     Args:
         folder: checkpoints and log; written every five minutes and at the end.
         kind: which prior.
+        total_steps: length of the schedule; None: the kind's own.
         init: optional folder of packed weights to start from instead of random ones; no step is small then.
         pairs: what to train on instead of freshly rendered pictures.
         half: multiply in bfloat16: faster on a processor that has it, slower on others.
     """
+    total_steps = kind.steps if total_steps is None else total_steps
     files = TrainingFolder(folder)
     torch.manual_seed(seed)
     scheduler, state = build_scheduler(kind.prediction), files.load()
