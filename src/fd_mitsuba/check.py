@@ -13,10 +13,11 @@ from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.cost import CostEstimate, estimate_cost
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
-from fd_mitsuba.scene.edit_scene import EditScene, gap_to_base, share_in_grid
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.part_material import part_material
+from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid
 from fd_mitsuba.scene.triangle_mesh import Topology, topology
 
 THINNEST_IN_CELLS = 3.0

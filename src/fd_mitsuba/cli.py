@@ -12,6 +12,7 @@ import os
 import shlex
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -190,13 +191,16 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _preview(options: argparse.Namespace) -> int:
-    scene = _load(options)
+    misplaced: list[UserError] = []
+    scene = _load(options, misplaced.append)
     from fd_mitsuba.preview import preview_scene
 
     name = Path(options.scene).resolve().parent.name
     folder = Path(options.output) if options.output else Path("runs") / f"{name}_preview"
     for path in preview_scene(scene, folder):
         print(path)
+    if misplaced:
+        raise misplaced[0]
     return 0
 
 
@@ -212,8 +216,8 @@ def _doctor(options: argparse.Namespace) -> int:
     return 0 if all(finding.ok for finding in findings) else 1
 
 
-def _load(options: argparse.Namespace):
-    """The scene, with Mitsuba started as the options say."""
+def _load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None):
+    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `load_edit_scene`."""
     parameters = definitions(options)
     prompt = None if options.prompt is None else " ".join(options.prompt.split())
     if prompt == "":
@@ -221,4 +225,4 @@ def _load(options: argparse.Namespace):
     start(options)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-    return load_edit_scene(options.scene, parameters, options.regions, prompt)
+    return load_edit_scene(options.scene, parameters, options.regions, prompt, on_misplaced)

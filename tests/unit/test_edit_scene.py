@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from conftest import BASE, write_ply
 
-from fd_mitsuba.scene.edit_scene import gap_to_base, load_edit_scene, share_in_grid
+from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import topology
 

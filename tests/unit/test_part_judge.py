@@ -24,7 +24,8 @@ from fd_mitsuba.prior.evaluate_parts import evaluate_parts, judge_sample, summar
 from fd_mitsuba.prior.part_judge import CHECKOUT_CLASSIFIER, LEAST_PIXELS, changed_pixels, load_judge, views_of
 from fd_mitsuba.prior.parts import PARTS
 from fd_mitsuba.prior.primitives import join
-from fd_mitsuba.scene.edit_scene import load_edit_scene, share_in_grid
+from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.region_place import share_in_grid
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.conventions import BASE_NAME, GRID_HALF_EXTENT
+from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
@@ -21,13 +22,12 @@ from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
 from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
+from fd_mitsuba.scene.region_place import gap_to_base, misplacement
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
 FOREIGN_MESHES = frozenset(".stl .glb .gltf .fbx .dae .off .3ds .blend .usd .usda .usdc .usdz .abc".split())
 """Suffixes of meshes that people have and Mitsuba does not read; of some its OBJ reader makes an empty mesh."""
-LEAST_SHARE_IN_GRID = 0.5
-"""A region with less of its volume than this in the grid cube is an error; a smaller overhang is a warning."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,7 @@ def load_edit_scene(
     parameters: dict[str, str] | None = None,
     regions: Path | str | None = None,
     prompt: str | None = None,
+    on_misplaced: Callable[[UserError], None] | None = None,
 ) -> EditScene:
     """Read a scene file, check it, and load it once in Mitsuba so that later loading cannot fail.
 
@@ -111,6 +112,8 @@ def load_edit_scene(
         regions: an XML file whose focal regions, `dual_path` integrator and `<bsdf id="part">` are taken too, in the
             frame of the scene.
         prompt: takes the place of the integrator's; a scene without `dual_path`, as an exported one, needs it.
+        on_misplaced: takes what is wrong with the place of a region, which is then kept as it is, so that a picture can
+            show it; None: it is raised.
 
     Raises:
         UserError: any input that cannot be edited, in one line with file, element and remedy.
@@ -136,9 +139,11 @@ def load_edit_scene(
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
-        if gap > region.size:
-            away = f"the region is {gap / frame.scale:.3g} away from the base, more than its own size"
-            raise element.error(f"{away}; move it closer")
+        problem = misplacement(region, gap, frame)
+        if problem and on_misplaced is None:
+            raise element.error(problem)
+        if problem:
+            on_misplaced(element.error(problem))
     check_modes([element for _, element in elements], found, base, frame, gaps)
     for source in inputs.sources:
         source.instantiate()
@@ -255,40 +260,4 @@ def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame
     region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element))
     if not region.volume > 0:
         raise element.error("the region has no volume; enlarge it")
-    inside = share_in_grid(region)
-    if inside < LEAST_SHARE_IN_GRID:
-        low, high = frame.to_user(np.full(3, -GRID_HALF_EXTENT)), frame.to_user(np.full(3, GRID_HALF_EXTENT))
-        box = f"{_short(low)} to {_short(high)}"
-        raise element.error(f"{inside:.0%} of the region lies in the editable cube {box}; move or shrink it")
     return region
-
-
-def share_in_grid(region: FocalRegion, samples: int = 24) -> float:
-    """Share of the region's volume within the grid cube [-1.05, 1.05]^3, sampled on a lattice over its bounds."""
-    low, high = region.bounds
-    steps = (np.arange(samples) + 0.5) / samples
-    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = low + lattice * (high - low)
-    points = points[region.sdf(points) > 0]
-    if not len(points):
-        points = region.surface(2).vertices
-    return float(np.mean(np.all(np.abs(points) <= GRID_HALF_EXTENT, axis=1)))
-
-
-def gap_to_base(region: FocalRegion, distance: MeshDistance, base: TriangleMesh) -> float:
-    """Distance between the region and the base in canonical units; 0 where they overlap or one contains the other.
-
-    Args:
-        distance: of the base in the canonical frame.
-        base: the same base in the canonical frame; its vertices are tested against the region too.
-    """
-    surface = region.surface(3).vertices
-    if distance.inside(surface).any():
-        return 0.0
-    to_surface = float(distance.unsigned(surface).min())
-    to_vertices = float(-region.sdf(base.vertices).max())
-    return max(min(to_surface, to_vertices), 0.0)
-
-
-def _short(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in point) + ")"
