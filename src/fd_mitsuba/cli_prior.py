@@ -49,7 +49,7 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
         help="sample a prior on unseen bodies and judge what it draws: a contact sheet beside the truth, and figures",
         description="Sample a prior on unseen bodies and judge what it draws. A shape sample of 16 steps takes about "
         "1.8 s of a core: the default (4 bodies, all parts, overviews and close-ups) 4 minutes, --bodies all about 20. "
-        "A colour sample takes 1 s, a painted prompt (--paint) about a minute.",
+        "A colour sample takes 1 s, a painted prompt (--paint) about 5 s.",
     )
     evaluate.add_argument("folder", nargs="?", help="packed prior; default: the built-in one")
     evaluate.add_argument("--kind", default="geometry", help="geometry (default), appearance or evaluator")

@@ -13,8 +13,9 @@ import fd_mitsuba.prior.train as train_module
 from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
 from fd_mitsuba.prior.kinds import APPEARANCE, KINDS, kind_named
+from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, tokenize
 from fd_mitsuba.prior.pack import pack
-from fd_mitsuba.prior.train import train
+from fd_mitsuba.prior.train import Pool, train
 from fd_mitsuba.prior.training_folder import TrainingFolder
 
 
@@ -46,6 +47,29 @@ def test_the_appearance_prior_trains_with_its_own_pictures(tmp_path: Path) -> No
     assert sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*")) < 10e6
     with pytest.raises(UserError, match="--kind appearance"):
         train(tmp_path / "run", seconds=600, batch_size=2, total_steps=2)
+
+
+@pytest.mark.slow
+def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
+    train(tmp_path, seconds=3600, kind=APPEARANCE, total_steps=600)
+    tokenizer = build_tokenizer()
+    modules = APPEARANCE.build_modules(tokenizer)
+    modules.load_state_dict(torch.load(tmp_path / "checkpoint.pt", weights_only=True)["modules"])
+    pool = Pool(APPEARANCE, seed=12345)
+    pool.refresh(64)
+    base, edited, part, captions = pool.batch(32)
+    times = torch.full((32,), 900)
+    alpha_bar = build_scheduler(APPEARANCE.prediction).alphas_cumprod[900]
+    noise = torch.randn(edited.shape, generator=torch.Generator().manual_seed(5)) * part
+    seen = torch.cat([alpha_bar.sqrt() * edited + (1 - alpha_bar).sqrt() * noise, base], dim=1)
+
+    def error(captions: list[str]) -> float:
+        with torch.no_grad():
+            words = modules["text_encoder"](tokenize(tokenizer, captions)).last_hidden_state
+            said = modules["unet"](seen, times, words).sample
+        return (((said - edited).square() * part).sum() / part.sum()).item()
+
+    assert error(captions) < 0.75 * error(captions[1:] + captions[:1])
 
 
 def test_kinds_are_named() -> None:
