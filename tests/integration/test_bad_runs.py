@@ -120,17 +120,24 @@ def test_missing_scene(command: str, tmp_path: Path, capfd: pytest.CaptureFixtur
     assert code == 1 and "none.xml: no such scene file" in line
 
 
-@pytest.mark.parametrize("place", ['<translate x="0.3" y="1.1"/>', '<translate x="40"/>', '<scale value="30"/>'])
+@pytest.mark.parametrize(
+    ("place", "mode"),
+    [
+        ('<scale value="0.1"/><translate x="0.3" y="1.1"/>', "add"),
+        ('<scale value="0.1"/><translate x="40"/>', "add"),
+        ('<scale value="30"/>', "add"),
+        ('<scale value="0.04"/><translate x="0.55" y="0.5" z="-0.4"/>', "subtract"),
+    ],
+)
 def test_preview_shows_a_misplaced_region(
-    make_scene: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str], place: str
+    make_scene: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str], place: str, mode: str
 ) -> None:
-    small = '<scale value="0.1"/>' if "scale" not in place else ""
-    region = f'<shape type="focal_region" id="wing"><transform name="to_world">{small}{place}</transform></shape>'
-    scene = make_scene(region=region)
+    inner = f'<string name="mode" value="{mode}"/><transform name="to_world">{place}</transform>'
+    scene = make_scene(region=f'<shape type="focal_region" id="wing">{inner}</shape>')
     assert main(["preview", str(scene), "-o", str(tmp_path / "out")]) == 1
     out, err = capfd.readouterr()
     assert out.split() == [str(tmp_path / "out" / "preview.png")] and (tmp_path / "out" / "preview.png").is_file()
-    assert err.count("\n") == 1 and "scene.xml" in err and "'wing'" in err.replace('"', "'") and "move" in err
+    assert err.count("\n") == 1 and "scene.xml" in err and 'id="wing"' in err and "move" in err
 
 
 @pytest.mark.parametrize("content", ["steps = ", "[geometry\n", "geometry = 3\n", "[output]\nsheet = 3\n"])

@@ -139,12 +139,12 @@ def load_edit_scene(
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
-        problem = misplacement(region, gap, frame)
-        if problem and on_misplaced is None:
-            raise element.error(problem)
-        if problem:
-            on_misplaced(element.error(problem))
-    check_modes([element for _, element in elements], found, base, frame, gaps)
+        if problem := misplacement(region, gap, frame):
+            error = element.error(problem)
+            if on_misplaced is None:
+                raise error
+            on_misplaced(error)
+    check_modes([element for _, element in elements], found, base, frame)
     for source in inputs.sources:
         source.instantiate()
     folder = file.path.parent

@@ -32,27 +32,23 @@ def check_modes(
     regions: tuple[FocalRegion, ...],
     base: tuple[TriangleMesh, ...],
     frame: Normalisation,
-    gaps: list[float],
 ) -> None:
     """Refuse regions that disagree, and cuts that cannot be made.
 
     Args:
         elements: of the regions, in their order.
         base: the meshes in the user frame.
-        gaps: distance between each region and the base, 0 where they overlap.
 
     Raises:
-        UserError: adding and subtracting in one scene; a cut that misses the base, takes all of it, comes near a mesh
+        UserError: adding and subtracting in one scene; a cut that takes all of the base, comes near a mesh
             that encloses nothing, or whose faces would have the name of a base shape.
     """
-    for element, region, gap in zip(elements, regions, gaps, strict=True):
+    for element, region in zip(elements, regions, strict=True):
         if region.mode != regions[0].mode:
             both = f"{region.mode}s, while {regions[0].name!r} {regions[0].mode}s"
             if region.part == regions[0].part:
                 raise element.error(f"{both}, and both are of part {region.part!r}; give them one mode")
             raise element.error(f"{both}; give all regions one mode, and edit in two runs")
-        if region.mode == SUBTRACT and gap > 0:
-            raise element.error("does not reach the base, so nothing can be cut out; move it into the base")
         taken = {mesh.name.lower(): mesh.name for mesh in base}
         if region.mode == SUBTRACT and (clash := taken.get(cut_faces_name(region.part).lower())):
             raise element.error(

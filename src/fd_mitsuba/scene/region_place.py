@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
-from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -21,6 +21,8 @@ def misplacement(region: FocalRegion, gap: float, frame: Normalisation) -> str |
         low, high = frame.to_user(np.full(3, -GRID_HALF_EXTENT)), frame.to_user(np.full(3, GRID_HALF_EXTENT))
         box = f"{_short(low)} to {_short(high)}"
         return f"{inside:.0%} of the region lies in the editable cube {box}; move or shrink it"
+    if region.mode == SUBTRACT and gap > 0:
+        return "does not reach the base, so nothing can be cut out; move it into the base"
     if gap > region.size:
         return f"the region is {gap / frame.scale:.3g} away from the base, more than its own size; move it closer"
     return None
