@@ -31,15 +31,15 @@ import trimesh  # noqa: E402
 from machine import print_figures  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from fd_mitsuba.appearance import finished_appearance  # noqa: E402
 from fd_mitsuba.evaluation.atlas_faults import foreign_colour, seam_jumps  # noqa: E402
 from fd_mitsuba.evaluation.base_drift import export_drift  # noqa: E402
 from fd_mitsuba.export.pictures import srgb_from_linear  # noqa: E402
-from fd_mitsuba.export.solid import Solid  # noqa: E402
+from fd_mitsuba.export.solid.solid import Solid  # noqa: E402
+from fd_mitsuba.runs.appearance_outcome import finished_appearance  # noqa: E402
+from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402
 from fd_mitsuba.scene.mesh_distance import MeshDistance  # noqa: E402
 from fd_mitsuba.scene.triangle_mesh import topology  # noqa: E402
-from fd_mitsuba.training.saved_run import saved_run  # noqa: E402
 
 MOST_JUMP = 2.0
 MOST_STRAY, MOST_STRAY_99 = 2.0, 1.0

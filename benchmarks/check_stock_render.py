@@ -34,12 +34,12 @@ from machine import print_figures  # noqa: E402
 from PIL import Image  # noqa: E402
 from torch.nn.functional import avg_pool2d  # noqa: E402
 
-from fd_mitsuba.appearance import finished_appearance  # noqa: E402
-from fd_mitsuba.evaluation.lit_views import ring_cameras, some_cameras  # noqa: E402
 from fd_mitsuba.export.pictures import srgb_from_linear  # noqa: E402
+from fd_mitsuba.runs.appearance_outcome import finished_appearance  # noqa: E402
+from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.scene_file import file_threads, ready_mitsuba  # noqa: E402
 from fd_mitsuba.training.appearance_stage import AppearanceStage  # noqa: E402
-from fd_mitsuba.training.saved_run import saved_run  # noqa: E402
+from fd_mitsuba.viewing.lit_views import ring_cameras, some_cameras  # noqa: E402
 
 SIZE, SPP, BLOCK = 128, 128, 8
 FINER = 4

@@ -20,18 +20,18 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
 
-from fd_mitsuba.threads import share_cores  # noqa: E402
+from fd_mitsuba.backend.threads import share_cores  # noqa: E402
 
 share_cores()
 
 import numpy as np  # noqa: E402
 from machine import print_figures  # noqa: E402
 
+from fd_mitsuba.backend.peak_memory import peak_memory_mb  # noqa: E402
 from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.export.assets import PartAsset, export_assets  # noqa: E402
 from fd_mitsuba.fields.texture import TextureField  # noqa: E402
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
-from fd_mitsuba.training.record import peak_memory_mb  # noqa: E402
 
 
 def lumpy_ball(faces: int) -> tuple[np.ndarray, np.ndarray]:

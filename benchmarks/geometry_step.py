@@ -29,7 +29,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
 
-from fd_mitsuba.threads import share_cores  # noqa: E402
+from fd_mitsuba.backend.threads import share_cores  # noqa: E402
 
 share_cores()
 

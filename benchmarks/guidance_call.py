@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
 
-from fd_mitsuba.threads import share_cores  # noqa: E402
+from fd_mitsuba.backend.threads import share_cores  # noqa: E402
 
 share_cores()
 

@@ -1,7 +1,7 @@
 """Put measured figures into the model card: `python benchmarks/model_card_tables.py`.
 
 Reads what `fd_mitsuba prior evaluate` (both kinds) and `benchmarks/prior_in_3d.py` left in `runs/` and rewrites the
-tables of `src/fd_mitsuba/prior/MODEL_CARD.md` between their markers. A file that is missing leaves its table as it is.
+tables of `src/fd_mitsuba/weights/MODEL_CARD.md` between their markers. A missing file leaves its table as it is.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
-mi = mitsuba_api.start()
+mi = startup.start()
 
 import drjit as dr  # noqa: E402
 import numpy as np  # noqa: E402

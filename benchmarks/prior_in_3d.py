@@ -27,21 +27,21 @@ import torch  # noqa: E402
 from prior_pairs import CASES, Case, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
-from fd_mitsuba.evaluation.turntable import render_ring, write_sheet  # noqa: E402
-from fd_mitsuba.geometry import load_finished_stage  # noqa: E402
-from fd_mitsuba.prior.corpus import CAMERA_RADIUS  # noqa: E402
-from fd_mitsuba.prior.part_judge import (  # noqa: E402
+from fd_mitsuba.io.json_object import write_json  # noqa: E402
+from fd_mitsuba.prior.judging.part_judge import (  # noqa: E402
     CHECKOUT_CLASSIFIER,
     LEAST_PIXELS,
     PartJudge,
     changed_pixels,
     load_judge,
 )
+from fd_mitsuba.prior.pictures.corpus import CAMERA_RADIUS  # noqa: E402
 from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
+from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
+from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.edit_scene import load_edit_scene  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
-from fd_mitsuba.training.run_folder import write_json  # noqa: E402
-from fd_mitsuba.training.saved_run import saved_run  # noqa: E402
+from fd_mitsuba.viewing.turntable import render_ring, write_sheet  # noqa: E402
 
 VIEWS, VIEW_SIZE, SHEET_SIZE = 8, 32, 112
 ELEVATION_DEG, HALF_WIDTH = 15.0, 1.25
@@ -107,7 +107,7 @@ def judge_run(case: Case, folder: Path, judge: PartJudge) -> tuple[dict, np.ndar
 
 
 def ring_views(mesh: Mesh, aim: np.ndarray) -> np.ndarray:
-    """Eight views (8, 4, 32, 32) of a canonical mesh as `prior.corpus` draws them: n coverage, 2 coverage - 1."""
+    """Eight views (8, 4, 32, 32) of a canonical mesh as `pictures.corpus` draws them: n coverage, 2 coverage - 1."""
     fov = 2 * np.degrees(np.arctan(HALF_WIDTH / CAMERA_RADIUS))
     azimuths = np.arange(VIEWS) * (360.0 / VIEWS)
     cameras = CameraBatch.around(azimuths, ELEVATION_DEG, CAMERA_RADIUS, fov, np.tile(aim, (VIEWS, 1)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fd_mitsuba.prior.captions import HELD_OUT, PART_WORDS
+from fd_mitsuba.prior.data.captions import HELD_OUT, PART_WORDS
 from fd_mitsuba.scene.normalisation import Normalisation
 
 

@@ -21,7 +21,7 @@ from model_card_tables import filled
 from PIL import Image
 
 from fd_mitsuba.evaluation.picture_difference import MOST_DECIBELS
-from fd_mitsuba.evaluation.score_table import COLUMNS, Column, header, markdown_table, scene_rows
+from fd_mitsuba.evaluation.report.score_table import COLUMNS, Column, header, markdown_table, scene_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "results.md"
@@ -187,7 +187,7 @@ def machine_lines() -> list[str]:
     """The machine that this is called on, which should be the one that made the runs."""
     from machine import machine
 
-    from fd_mitsuba.mitsuba_api import start
+    from fd_mitsuba.backend.startup import start
 
     start()
     about = machine()

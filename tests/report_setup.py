@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.evaluation.turntable import write_sheet, write_video
+from fd_mitsuba.viewing.turntable import write_sheet, write_video
 
 PROMPT = 'a cat with a <b>"crown"</b> & a hat'
 

@@ -15,7 +15,7 @@ found() {
         done
     done
     [ -x .venv/bin/python ] && .venv/bin/python - <<'PYTHON' 2>/dev/null
-from fd_mitsuba.mitsuba_api import find_llvm
+from fd_mitsuba.backend.startup import find_llvm
 find_llvm()
 PYTHON
 }

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.data.parts import PARTS
 
 CLASSES = (*PARTS, "none")
 """What a view may show; `none`: nothing was added, or a blob that is no part."""

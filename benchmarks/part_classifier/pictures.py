@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
-from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.corpus import MosaicCamera, RayCaster, closeup_camera, shade, vertex_normals
-from fd_mitsuba.prior.parts import PARTS
-from fd_mitsuba.prior.primitives import Solid, ellipsoid, join, rotation
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.data.primitives import Solid, ellipsoid, join, rotation
+from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, closeup_camera, shade, vertex_normals
 
 SEEN_SEED = 2**33
 """Training draws from here on, far from the prior's seeds (below 2**31), its evaluation's and the CLIP evaluator's."""

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from model import CLASSES, PartNetwork, load_classifier, save_classifier  # noqa: E402
 from pictures import SEEN_SEED, UNSEEN_SEED, Views, make_views  # noqa: E402
 
-from fd_mitsuba.prior.bodies import BODIES  # noqa: E402
+from fd_mitsuba.prior.data.bodies import BODIES  # noqa: E402
 
 FOLDER = Path(__file__).parent
 _BATCH = 96

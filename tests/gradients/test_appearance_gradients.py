@@ -24,7 +24,7 @@ from appearance_setup import (
     write_sky,
 )
 
-from fd_mitsuba.config_sections import TextureConfig
+from fd_mitsuba.config.sections import TextureConfig
 from fd_mitsuba.fields.texture import TextureField
 
 SIZE = 8

@@ -10,16 +10,16 @@ import pytest
 import torch
 import trimesh
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
-mitsuba_api.start()
+startup.start()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 from skimage.measure import marching_cubes  # noqa: E402
 
+from fd_mitsuba.backend import bridge  # noqa: E402
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS  # noqa: E402
-from fd_mitsuba.render import bridge  # noqa: E402
 from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
 from fd_mitsuba.render.vertex_normals import vertex_normals  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402

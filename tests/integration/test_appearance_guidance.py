@@ -12,13 +12,13 @@ import torch
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.config_sections import AppearanceConfig
+from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance import builtin, loading
 from fd_mitsuba.guidance.diffusion import MASK_THRESHOLD, DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, NonFiniteGuidance
-from fd_mitsuba.prior.kinds import APPEARANCE
-from fd_mitsuba.prior.model import build_tokenizer
-from fd_mitsuba.prior.pack import pack
+from fd_mitsuba.prior.training.kinds import APPEARANCE
+from fd_mitsuba.prior.training.model import build_tokenizer
+from fd_mitsuba.prior.training.pack import pack
 
 KINDS = ("sd15", "sd21", "ip2p", "tiny_vae", "builtin")
 

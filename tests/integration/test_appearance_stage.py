@@ -13,15 +13,15 @@ from conftest import BASE
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.evaluation.lit_views import ring_cameras
-from fd_mitsuba.evaluation.preservation import measure_preservation
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult
 from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.runs.preservation import measure_preservation
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.record import read_metrics
+from fd_mitsuba.viewing.lit_views import ring_cameras
 
 RED = torch.tensor([0.9, 0.1, 0.1]).view(1, 3, 1, 1)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.training.checkpoint import list_checkpoints
 
 Make = Callable[..., Path]

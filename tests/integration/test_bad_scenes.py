@@ -310,10 +310,10 @@ def test_one_thread_can_read_an_exr(make_scene: Make, tmp_path: Path) -> None:
     program = """if True:
         import sys
         import numpy as np
-        from fd_mitsuba import mitsuba_api
+        from fd_mitsuba.backend import startup
         from fd_mitsuba.scene.edit_scene import load_edit_scene
         from fd_mitsuba.scene.scene_file import file_threads
-        mi = mitsuba_api.start(threads=1)
+        mi = startup.start(threads=1)
         import drjit as dr
         with file_threads():
             mi.Bitmap(np.ones((64, 128, 3), np.float32)).write(sys.argv[2])

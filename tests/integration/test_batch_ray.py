@@ -16,7 +16,7 @@ from conftest import BASE, INTEGRATOR, PART, REGION, write_ply
 from test_whole_run import LIGHT, SETTINGS
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.batch import is_finished, job_matrix
+from fd_mitsuba.batch.local import is_finished, job_matrix
 from fd_mitsuba.training.record import read_metrics
 
 pytest.importorskip("ray")

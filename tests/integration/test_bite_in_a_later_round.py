@@ -11,8 +11,8 @@ import trimesh
 from test_two_rounds import SMALL, first, of_part  # noqa: F401
 
 from fd_mitsuba.config import load_config
-from fd_mitsuba.parts import list_parts
-from fd_mitsuba.pipeline import export_run, run
+from fd_mitsuba.runs.parts import list_parts
+from fd_mitsuba.runs.pipeline import export_run, run
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
 BITE = """<scene version="3.0.0"><shape type="focal_region" id="bite"><string name="part" value="bite"/>
@@ -29,7 +29,7 @@ def test_a_bite(
     y: float,
     z: float,
 ) -> None:
-    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.runs.geometry_outcome._write_turntable", lambda *_: None)
     regions, folder = tmp_path / "bite.xml", tmp_path / "run"
     regions.write_text(BITE.format(size=0.12, y=y, z=z))
     scene = load_edit_scene(first / "mitsuba" / "scene.xml", regions=regions, prompt="a pig with a bite")

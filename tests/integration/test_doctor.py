@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fd_mitsuba import doctor
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.runs import doctor
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ["python", "cores", "llvm", "mitsuba", "torch", "diffusers", "built-in prior", "memory"]

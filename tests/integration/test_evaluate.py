@@ -11,11 +11,12 @@ import torch
 from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from PIL import Image
 
-from fd_mitsuba import evaluate, pipeline
-from fd_mitsuba.ablation import ablate, ablation_jobs, chosen_rows
-from fd_mitsuba.ablation_table import ablation_header, ablation_rows, write_ablation_sheet
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
+from fd_mitsuba.evaluation import run_evaluation as evaluate
+from fd_mitsuba.evaluation.ablation import ablate, ablation_jobs, chosen_rows
+from fd_mitsuba.evaluation.ablation_table import ablation_header, ablation_rows, write_ablation_sheet
 from fd_mitsuba.evaluation.clip import ClipJudge
+from fd_mitsuba.runs import pipeline
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
 SETTINGS = """
@@ -78,7 +79,7 @@ def test_an_ablation_from_runs_to_table(place: Path, monkeypatch: pytest.MonkeyP
     rows = chosen_rows(["no_focal", "single_path"])
     jobs = ablation_jobs(place / "scene.xml", place / "tiny.toml", [0], rows, place / "out")
     scene = load_edit_scene(place / "scene.xml")
-    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.runs.geometry_outcome._write_turntable", lambda *_: None)
     for job in (*jobs[0], *jobs[1]):  # in this process: the batch then finds them finished
         stages = pipeline.STAGES if job.stage == "all" else ("geometry",)
         pipeline.run(scene, job.settings(), job.folder, False, "", True, lambda line: None, stages, job.geometry_from)

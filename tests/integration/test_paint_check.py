@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.config_sections import AppearanceConfig
+from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance.colour_latents import colour_latents
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.prior.kinds import APPEARANCE
-from fd_mitsuba.prior.model import build_tokenizer
-from fd_mitsuba.prior.pack import pack
-from fd_mitsuba.prior.paint_check import paint
+from fd_mitsuba.prior.judging.paint_check import paint
+from fd_mitsuba.prior.training.kinds import APPEARANCE
+from fd_mitsuba.prior.training.model import build_tokenizer
+from fd_mitsuba.prior.training.pack import pack
 
 
 class _Green(torch.nn.Module):

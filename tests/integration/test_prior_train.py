@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
-import fd_mitsuba.prior.train as train_module
+import fd_mitsuba.prior.training.train as train_module
 from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
-from fd_mitsuba.prior.kinds import APPEARANCE, KINDS, kind_named
-from fd_mitsuba.prior.model import build_scheduler, build_tokenizer, tokenize
-from fd_mitsuba.prior.pack import pack
-from fd_mitsuba.prior.train import Pool, train
-from fd_mitsuba.prior.training_folder import TrainingFolder
+from fd_mitsuba.prior.training.kinds import APPEARANCE, KINDS, kind_named
+from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, tokenize
+from fd_mitsuba.prior.training.pack import pack
+from fd_mitsuba.prior.training.train import Pool, train
+from fd_mitsuba.prior.training.training_folder import TrainingFolder
 
 
 def test_training_resumes_and_starts_from_packed_weights(tmp_path: Path) -> None:

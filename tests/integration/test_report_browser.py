@@ -16,8 +16,8 @@ from report_setup import make_run
 from test_export_assets import Learned, exported, textured_base  # noqa: F401
 from viewer_setup import VIEWERS, needs_browser
 
-from fd_mitsuba.evaluation.gallery import write_gallery
-from fd_mitsuba.evaluation.report import write_report
+from fd_mitsuba.evaluation.report.gallery import write_gallery
+from fd_mitsuba.evaluation.report.run_page import write_report
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), needs_browser]

@@ -24,13 +24,14 @@ from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from PIL import Image
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import load_config
-from fd_mitsuba.export.part_solid import part_solid
-from fd_mitsuba.geometry import load_finished_stage
+from fd_mitsuba.export.solid.part_solid import part_solid
+from fd_mitsuba.io.atomic import is_litter
+from fd_mitsuba.runs.geometry_outcome import load_finished_stage
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.training.checkpoint import is_litter, list_checkpoints
+from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.record import read_metrics
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -403,7 +404,7 @@ def test_weight_zero_turns_the_work_off(
         raise AssertionError("work for a loss that does not count")
 
     for name in ("loss_focal", "loss_collision", "DiffusionGuidance.load"):
-        module = "fd_mitsuba.geometry" if "." in name else "fd_mitsuba.training.field_losses"
+        module = "fd_mitsuba.runs.geometry_outcome" if "." in name else "fd_mitsuba.training.field_losses"
         monkeypatch.setattr(f"{module}.{name}", never)
     weights = ("lambda_sds=0", "lambda_focal=0", "lambda_collision=0", "lambda_volume=0.1")
     assert run_here(place, "off", *[word for weight in weights for word in ("--set", f"geometry.{weight}")]) == 0

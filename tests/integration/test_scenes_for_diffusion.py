@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

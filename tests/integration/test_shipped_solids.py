@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.export.part_solid import part_solid
+from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.triangle_mesh import topology
 from fd_mitsuba.training.geometry_stage import GeometryStage

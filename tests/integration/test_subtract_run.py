@@ -14,11 +14,11 @@ import trimesh
 from conftest import write_ply
 from PIL import Image
 
-from fd_mitsuba.appearance import render_run
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import load_config
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.pipeline import export_run, run
+from fd_mitsuba.runs.appearance_outcome import render_run
+from fd_mitsuba.runs.pipeline import export_run, run
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
@@ -65,7 +65,7 @@ def ball(tmp_path: Path) -> str:
 @pytest.fixture
 def no_turntable(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves out the pictures, which take most of such a run's time."""
-    monkeypatch.setattr("fd_mitsuba.geometry._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.runs.geometry_outcome._write_turntable", lambda *_: None)
 
 
 def lens() -> float:

@@ -14,16 +14,16 @@ import pytest
 import torch
 from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig, load_config
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
+from fd_mitsuba.runs.run_folder import describe_run
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, save_checkpoint
 from fd_mitsuba.training.geometry_stage import GeometryStage
-from fd_mitsuba.training.run_folder import describe_run
 
 WINGS = REGION.replace("<transform", '<string name="part" value="wings"/><transform')
 HORN = """<shape type="focal_region" id="horn">{name}<transform name="to_world">

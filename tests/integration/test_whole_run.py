@@ -12,7 +12,7 @@ from conftest import BASE, INTEGRATOR, PART, REGION, write_ply
 from PIL import Image
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.record import read_metrics
 

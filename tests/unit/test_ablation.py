@@ -6,12 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from fd_mitsuba.ablation import FULL, ROWS, RowResult, ablation_jobs, chosen_rows
-from fd_mitsuba.ablation_table import ablation_header, ablation_rows
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.evaluate import Protocol, builtin_vocabulary
-from fd_mitsuba.evaluation.scene_prompts import other_parts, prompts_of_scenes
-from fd_mitsuba.evaluation.score_table import (
+from fd_mitsuba.evaluation.ablation import FULL, ROWS, RowResult, ablation_jobs, chosen_rows
+from fd_mitsuba.evaluation.ablation_table import ablation_header, ablation_rows
+from fd_mitsuba.evaluation.report.score_table import (
     COLUMNS,
     header,
     markdown_table,
@@ -20,6 +18,8 @@ from fd_mitsuba.evaluation.score_table import (
     score_rows,
     summary_lines,
 )
+from fd_mitsuba.evaluation.run_evaluation import Protocol, builtin_vocabulary
+from fd_mitsuba.evaluation.scene_prompts import other_parts, prompts_of_scenes
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ROOT / "configs" / "quick.toml"

@@ -24,7 +24,7 @@ from appearance_setup import (
     write_sky,
 )  # fmt: skip
 
-from fd_mitsuba.config_sections import TextureConfig
+from fd_mitsuba.config.sections import TextureConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.scene_file import ready_mitsuba

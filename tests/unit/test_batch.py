@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from fd_mitsuba.batch import Job, Outcome, is_finished, job_matrix, run_batch
-from fd_mitsuba.batch_record import read_record
-from fd_mitsuba.cli import main
+from fd_mitsuba.batch.local import Job, Outcome, is_finished, job_matrix, run_batch
+from fd_mitsuba.batch.record import read_record
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import load_config
 from fd_mitsuba.errors import UserError
 

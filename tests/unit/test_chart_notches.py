@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fd_mitsuba.export.chart_notches import charts_of, open_notches
+from fd_mitsuba.export.bake.chart_notches import charts_of, open_notches
 
 DENSITY = 100.0
 

@@ -9,13 +9,13 @@ import pytest
 from conftest import BASE, write_ply
 from PIL import Image
 
-from fd_mitsuba.check import check_scene
 from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig, load_config
-from fd_mitsuba.cost import LIT_PICTURES_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import working_set_bytes
-from fd_mitsuba.preview import preview_scene, region_colours
+from fd_mitsuba.runs.check import check_scene
+from fd_mitsuba.runs.cost import LIT_PICTURES_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
 from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.viewing.preview import preview_scene, region_colours
 
 Make = Callable[..., Path]
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,14 +14,13 @@ from safetensors.torch import save_file
 from torch import nn
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.atomic import is_litter, write_atomically
 from fd_mitsuba.training.checkpoint import (
     CheckpointHeader,
     checkpoint_path,
-    is_litter,
     list_checkpoints,
     load_newest,
     save_checkpoint,
-    write_atomically,
 )
 
 HASH = "0123456789abcdef"

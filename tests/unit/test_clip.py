@@ -15,7 +15,7 @@ from transformers import AutoTokenizer, CLIPConfig, CLIPImageProcessorPil, CLIPM
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation import clip_loading
 from fd_mitsuba.evaluation.clip import ClipJudge, clip_direction, cosines
-from fd_mitsuba.prior.clip_model import build_clip_tokenizer
+from fd_mitsuba.prior.training.clip_model import build_clip_tokenizer
 
 TEXTS = ["a horse with wings", "a picture of a mug", "cat, crown"]
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from fd_mitsuba.evaluation.clip import ClipJudge
-from fd_mitsuba.prior.captions import BODY_WORDS, PART_WORDS, vocabulary
-from fd_mitsuba.prior.clip_captions import ANY_STYLE, NO_PART, STYLES, Claim, true_of, write_caption
-from fd_mitsuba.prior.clip_corpus import TRAINING_SEED, UNSEEN_SEED, random_pictures
-from fd_mitsuba.prior.clip_evaluate import retrieval
-from fd_mitsuba.prior.clip_model import build_clip_tokenizer
-from fd_mitsuba.prior.clip_train import SEEDS_A_SHARD, SHARDS, contrastive_loss, train_evaluator
-from fd_mitsuba.prior.evaluate import UNSEEN_SEED as PRIOR_UNSEEN_SEED
-from fd_mitsuba.prior.pack import pack
+from fd_mitsuba.prior.data.captions import BODY_WORDS, PART_WORDS, vocabulary
+from fd_mitsuba.prior.data.clip_captions import ANY_STYLE, NO_PART, STYLES, Claim, true_of, write_caption
+from fd_mitsuba.prior.judging.clip_evaluate import retrieval
+from fd_mitsuba.prior.judging.evaluate import UNSEEN_SEED as PRIOR_UNSEEN_SEED
+from fd_mitsuba.prior.pictures.clip_corpus import TRAINING_SEED, UNSEEN_SEED, random_pictures
+from fd_mitsuba.prior.training.clip_model import build_clip_tokenizer
+from fd_mitsuba.prior.training.clip_train import SEEDS_A_SHARD, SHARDS, contrastive_loss, train_evaluator
+from fd_mitsuba.prior.training.pack import pack
 
 
 def test_no_seed_is_shared() -> None:
@@ -71,8 +71,8 @@ def test_pictures_are_the_seeds_and_in_pairs() -> None:
 
 def test_training_learns_resumes_and_packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("SHARDS", 1), ("EVEN_SHARDS", 1), ("SETTLING", 0.25)):
-        monkeypatch.setattr(f"fd_mitsuba.prior.clip_train.{name}", value)
-    monkeypatch.setattr("fd_mitsuba.prior.clip_train.SEEDS_A_SHARD", 2)
+        monkeypatch.setattr(f"fd_mitsuba.prior.training.clip_train.{name}", value)
+    monkeypatch.setattr("fd_mitsuba.prior.training.clip_train.SEEDS_A_SHARD", 2)
     for steps in (4, 8):
         train_evaluator(tmp_path / "run", 100, total_steps=steps, batch_size=12, data=tmp_path / "data", least_shards=1)
     state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)

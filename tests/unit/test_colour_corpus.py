@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from skimage.color import rgb2lab
 
-from fd_mitsuba.prior import light, looks
-from fd_mitsuba.prior.captions import COLOURS, MATERIALS, PART_WORDS, vocabulary
-from fd_mitsuba.prior.colour_corpus import colour_caption, make_colour_pairs, part_views
-from fd_mitsuba.prior.evaluate_colour import balanced_cases, colours, prompt
-from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.data import looks
+from fd_mitsuba.prior.data.captions import COLOURS, MATERIALS, PART_WORDS, vocabulary
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.judging.evaluate_colour import balanced_cases, colours, prompt
+from fd_mitsuba.prior.pictures import light
+from fd_mitsuba.prior.pictures.colour_corpus import colour_caption, make_colour_pairs, part_views
 
 WHITE = np.ones((light.HEIGHT, light.WIDTH, 3))
 

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.cut_base import CutMesh, cut_mesh
-from fd_mitsuba.export.solid import Solid
+from fd_mitsuba.export.solid.cut_base import CutMesh, cut_mesh
+from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from fd_mitsuba import batch, cli_evaluate
-from fd_mitsuba.cli import main
-from fd_mitsuba.evaluate_many import evaluate_at_once
+from fd_mitsuba.batch import local as batch
+from fd_mitsuba.cli import evaluate as cli_evaluate
+from fd_mitsuba.cli.main import main
+from fd_mitsuba.evaluation.side_processes import evaluate_at_once
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITES_ITS_WORDS = (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from fd_mitsuba.prior.evaluate_paint import nearest_shares, painted_figures
-from fd_mitsuba.prior.paint_check import Painted
+from fd_mitsuba.prior.judging.evaluate_paint import nearest_shares, painted_figures
+from fd_mitsuba.prior.judging.paint_check import Painted
 
 
 def painted(nearest: str, metallic: float, roughness: float = 0.6) -> Painted:

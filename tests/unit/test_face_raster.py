@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
-mi = mitsuba_api.start()
+mi = startup.start()
 
+from fd_mitsuba.backend.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.render.cameras import FilmCameras  # noqa: E402
 from fd_mitsuba.render.mesh_tracer import Hit, MeshTracer  # noqa: E402
-from fd_mitsuba.render.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 SIZE, PER_VIEW = 32, 4000

@@ -9,16 +9,16 @@ import pytest
 import torch
 import trimesh
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
-mi = mitsuba_api.start()
+mi = startup.start()
 
+from fd_mitsuba.backend.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.render.cameras import FilmCameras  # noqa: E402
 from fd_mitsuba.render.enclosing import is_closed, is_outside  # noqa: E402
 from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
 from fd_mitsuba.render.mesh_edges import corners, pair_closed, pair_half_edges  # noqa: E402
 from fd_mitsuba.render.silhouette import find_outline  # noqa: E402
-from fd_mitsuba.render.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 Mesh = tuple[torch.Tensor, torch.Tensor, torch.Tensor]

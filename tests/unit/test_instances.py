@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import write_ply
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instances import anchored, read_placements, write_instances
 from fd_mitsuba.scene.tessellate import unit_sphere

@@ -1,8 +1,9 @@
-"""Data flows one way: a module imports only from its own layer or from the layers above it."""
+"""Data flows one way: a package imports only from those above it; within a package, imports have no cycle."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 from pathlib import Path
 
 import pytest
@@ -11,16 +12,17 @@ import fd_mitsuba
 
 ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
-    "conventions errors config_sections config mitsuba_api threads scene fields extraction render guidance losses "
-    "training export evaluation prior cost check preview doctor geometry appearance pipeline parts cli_options "
-    "batch_job batch_record batch_ray batch cli_batch cli_report evaluate evaluate_many ablation ablation_table "
-    "cli_evaluate cli_ablate cli_export cli_prior cli __main__"
+    "conventions errors io config backend scene fields extraction render losses guidance viewing training export runs "
+    "batch evaluation prior cli __main__"
 ).split()
+"""Packages and modules of the root; batch stands above evaluation, because ablations and tables of many scenes run
+through it."""
+MOST_ROOT_MODULES = 6
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
 
 
-def imported_layers(path: Path) -> set[str]:
-    """First name below `fd_mitsuba` of every import in the file, those inside functions included."""
+def imported_modules(path: Path) -> set[str]:
+    """Dotted names of all that the file imports, inside functions too; of `from a import b` both `a` and `a.b`."""
     package = ("fd_mitsuba", *path.relative_to(ROOT).with_suffix("").parts)
     names = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -28,8 +30,13 @@ def imported_layers(path: Path) -> set[str]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             origin = ".".join(filter(None, [*package[: -node.level], node.module])) if node.level else node.module or ""
-            names |= {f"{origin}.{alias.name}" for alias in node.names}
-    parts = [name.split(".") for name in names]
+            names |= {origin} | {f"{origin}.{alias.name}" for alias in node.names}
+    return names
+
+
+def imported_layers(path: Path) -> set[str]:
+    """First name below `fd_mitsuba` of every import in the file."""
+    parts = [name.split(".") for name in imported_modules(path)]
     return {part[1] for part in parts if part[0] == "fd_mitsuba" and len(part) > 1 and part[1] != "__version__"}
 
 
@@ -39,3 +46,17 @@ def test_imports_only_from_layers_above(path: Path) -> None:
     assert own in LAYERS, f"{own} is in no layer; add it to LAYERS here and to the architecture"
     below = {name for name in imported_layers(path) if LAYERS.index(name) > LAYERS.index(own)}
     assert not below, f"{path.relative_to(ROOT)} imports from below: {sorted(below)}"
+
+
+def test_root_holds_few_modules() -> None:
+    assert len(list(ROOT.glob("*.py"))) <= MOST_ROOT_MODULES
+
+
+def test_modules_import_each_other_without_cycles() -> None:
+    names = {
+        path: ".".join(("fd_mitsuba", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+        for path in MODULES
+    }
+    known = set(names.values())
+    imports = {name: {other for other in imported_modules(path) if other in known} for path, name in names.items()}
+    graphlib.TopologicalSorter(imports).prepare()  # CycleError names the modules

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fd_mitsuba.evaluation.lit_views import lit_ring, ring_cameras
+from fd_mitsuba.viewing.lit_views import lit_ring, ring_cameras
 
 
 class Board:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fd_mitsuba.evaluation.locality import Locality, measure_locality
+from fd_mitsuba.runs.locality import Locality, measure_locality
 from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.tessellate import unit_sphere
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
-mi = mitsuba_api.start()
+mi = startup.start()
 
+from fd_mitsuba.backend.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.render.cameras import FilmCameras  # noqa: E402
 from fd_mitsuba.render.mesh_edges import MeshEdges  # noqa: E402
 from fd_mitsuba.render.outline import clip_outline  # noqa: E402
-from fd_mitsuba.render.upload import upload_floats, upload_indices  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 SIZE, VIEWS, EDGES = 32, 3, 4000

@@ -17,13 +17,13 @@ from PIL import Image
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
 from fd_mitsuba.guidance.mosaic import tile_views
-from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.body_namer import BodyNamer
-from fd_mitsuba.prior.corpus import Pair, RayCaster, make_pairs, shade
-from fd_mitsuba.prior.evaluate_parts import evaluate_parts, judge_sample, summary
-from fd_mitsuba.prior.part_judge import CHECKOUT_CLASSIFIER, LEAST_PIXELS, changed_pixels, load_judge, views_of
-from fd_mitsuba.prior.parts import PARTS
-from fd_mitsuba.prior.primitives import join
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.data.primitives import join
+from fd_mitsuba.prior.judging.body_namer import BodyNamer
+from fd_mitsuba.prior.judging.evaluate_parts import evaluate_parts, judge_sample, summary
+from fd_mitsuba.prior.judging.part_judge import CHECKOUT_CLASSIFIER, LEAST_PIXELS, changed_pixels, load_judge, views_of
+from fd_mitsuba.prior.pictures.corpus import Pair, RayCaster, make_pairs, shade
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.region_place import share_in_grid
 
@@ -146,7 +146,7 @@ def test_a_folder_without_a_classifier_is_named(tmp_path: Path) -> None:
 
 def test_ring_views_of_the_renderer_are_those_of_the_corpus() -> None:
     in_3d = benchmark("prior_in_3d")
-    corpus = sys.modules["fd_mitsuba.prior.corpus"]
+    corpus = sys.modules["fd_mitsuba.prior.pictures.corpus"]
     random = np.random.default_rng(3)
     body = BODIES["horse"](random)
     part = PARTS["wings"](body, random)

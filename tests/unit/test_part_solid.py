@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from fd_mitsuba.config import FieldConfig, GeometryConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.part_pieces import BRIDGE_REACH
 from fd_mitsuba.export.part_record import anchor
-from fd_mitsuba.export.part_solid import SINK_CELLS, fillet_reach, part_solid
-from fd_mitsuba.export.solid import Solid
+from fd_mitsuba.export.solid.part_pieces import BRIDGE_REACH
+from fd_mitsuba.export.solid.part_solid import SINK_CELLS, fillet_reach, part_solid
+from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid

@@ -6,11 +6,11 @@ import torch
 
 from fd_mitsuba.config import CamerasConfig
 from fd_mitsuba.guidance.mosaic import tile_views
-from fd_mitsuba.prior import corpus
-from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.corpus import MosaicCamera, RayCaster, make_pairs, shade
-from fd_mitsuba.prior.parts import FEET, PARTS, resized
-from fd_mitsuba.prior.primitives import Solid, box, join, transform
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.parts import FEET, PARTS, resized
+from fd_mitsuba.prior.data.primitives import Solid, box, join, transform
+from fd_mitsuba.prior.pictures import corpus
+from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, make_pairs, shade
 from fd_mitsuba.scene.views import sample_views
 
 

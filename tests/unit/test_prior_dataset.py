@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.prior import dataset
-from fd_mitsuba.prior.captions import HELD_OUT
-from fd_mitsuba.prior.dataset import StoredPairs, build_data
-from fd_mitsuba.prior.kinds import APPEARANCE, GEOMETRY
-from fd_mitsuba.prior.train import draw_pairs, train
+from fd_mitsuba.prior.data.captions import HELD_OUT
+from fd_mitsuba.prior.training import dataset
+from fd_mitsuba.prior.training.dataset import StoredPairs, build_data
+from fd_mitsuba.prior.training.kinds import APPEARANCE, GEOMETRY
+from fd_mitsuba.prior.training.train import draw_pairs, train
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ from fd_mitsuba.guidance.builtin import builtin_folder
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews
 from fd_mitsuba.guidance.prompts import unknown_words, view_prompt
-from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.captions import PART_WORDS, caption, view_words, vocabulary
-from fd_mitsuba.prior.evaluate import evaluate
-from fd_mitsuba.prior.model import TEXT_LENGTH, build_text_encoder, build_tokenizer, build_unet
-from fd_mitsuba.prior.pack import pack
-from fd_mitsuba.prior.parts import PARTS
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.captions import PART_WORDS, caption, view_words, vocabulary
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.judging.evaluate import evaluate
+from fd_mitsuba.prior.training.model import TEXT_LENGTH, build_text_encoder, build_tokenizer, build_unet
+from fd_mitsuba.prior.training.pack import pack
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_every_word_of_the_vocabulary_is_one_token() -> None:
 
 def test_tokens_are_numbered_alike_in_every_process() -> None:
     """Weights fit one numbering only, so training, resume and packing must agree on it."""
-    code = "from fd_mitsuba.prior.model import build_tokenizer as b; print(sorted(b().get_vocab().items()))"
+    code = "from fd_mitsuba.prior.training.model import build_tokenizer as b; print(sorted(b().get_vocab().items()))"
     environment = {**os.environ, "PYTHONHASHSEED": "1"}
     elsewhere = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True).stdout
     assert elsewhere.strip() == str(sorted(build_tokenizer().get_vocab().items()))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
-from fd_mitsuba.prior.vae import TAU, build_vae
+from fd_mitsuba.prior.training.vae import TAU, build_vae
 
 
 def hard_edged(cell: int, count: int = 2, size: int = 64, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,10 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from fd_mitsuba.evaluation.turntable import write_sheet, write_video
 from fd_mitsuba.training.geometry_stage import StepRecord
 from fd_mitsuba.training.record import Recorder, read_metrics
-from fd_mitsuba.training.sheets import normal_pictures
+from fd_mitsuba.viewing.sheets import normal_pictures
+from fd_mitsuba.viewing.turntable import write_sheet, write_video
 
 
 def write(folder: Path, first: int, last: int, done: int = 0) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fd_mitsuba.prior.replicas import Replicas
+from fd_mitsuba.prior.training.replicas import Replicas
 
 SIZE = 5
 

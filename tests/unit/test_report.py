@@ -15,16 +15,16 @@ import pytest
 from PIL import Image
 from report_setup import PROMPT, film, make_run
 
-from fd_mitsuba.cli import main
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import Interrupted, UserError
-from fd_mitsuba.evaluation import report as report_module
-from fd_mitsuba.evaluation.curves import curve_svg, stage_curves
-from fd_mitsuba.evaluation.figure_table import duration, figure_tables
-from fd_mitsuba.evaluation.film_strip import common_crop, sheet_row, strip
-from fd_mitsuba.evaluation.gallery import write_gallery
-from fd_mitsuba.evaluation.report import PAGE, reported, viewer_script, write_report
-from fd_mitsuba.evaluation.run_record import changed_settings, read_run
-from fd_mitsuba.evaluation.turntable import write_sheet
+from fd_mitsuba.evaluation.report import run_page as report_module
+from fd_mitsuba.evaluation.report.curves import curve_svg, stage_curves
+from fd_mitsuba.evaluation.report.gallery import write_gallery
+from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
+from fd_mitsuba.evaluation.report.run_page import PAGE, reported, viewer_script, write_report
+from fd_mitsuba.evaluation.report.run_record import changed_settings, read_run
+from fd_mitsuba.viewing.film_strip import common_crop, sheet_row, strip
+from fd_mitsuba.viewing.turntable import write_sheet
 
 VOID = {"meta", "link", "input", "img", "br"}
 

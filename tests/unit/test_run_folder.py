@@ -9,8 +9,8 @@ import pytest
 
 from fd_mitsuba.config import RunConfig, load_config
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
+from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
-from fd_mitsuba.training.run_folder import check_folder, describe_run, discarded_without_checkpoint
 
 Make = Callable[..., Path]
 CONFIG = RunConfig()

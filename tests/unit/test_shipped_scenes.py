@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fd_mitsuba.check import check_scene
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.prior.captions import vocabulary
+from fd_mitsuba.prior.data.captions import vocabulary
+from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 from fd_mitsuba.scene.scene_file import SceneFile, ready_mitsuba
 

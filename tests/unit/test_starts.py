@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from fd_mitsuba.prior.bodies import BODIES
-from fd_mitsuba.prior.parts import PARTS
-from fd_mitsuba.prior.primitives import Solid
-from fd_mitsuba.prior.starts import starts_like
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.data.primitives import Solid
+from fd_mitsuba.prior.data.starts import starts_like
 
 
 def pieces(solid: Solid) -> list[trimesh.Trimesh]:

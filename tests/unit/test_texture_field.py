@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from fd_mitsuba.config_sections import TextureConfig
+from fd_mitsuba.config.sections import TextureConfig
 from fd_mitsuba.fields.free_points import features_at
 from fd_mitsuba.fields.hash_grid import HashGrid
 from fd_mitsuba.fields.texture import TextureField

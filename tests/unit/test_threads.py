@@ -8,7 +8,7 @@ import drjit as dr
 import pytest
 import torch
 
-from fd_mitsuba import threads
+from fd_mitsuba.backend import threads
 
 
 def test_the_network_gets_the_cores_and_gives_them_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, label
 
-from fd_mitsuba.export.atlas_raster import rasterise, weights_at
-from fd_mitsuba.export.tangents import vertex_normals, vertex_tangents
-from fd_mitsuba.export.unwrap import padding_for, unwrap
+from fd_mitsuba.export.bake.atlas_raster import rasterise, weights_at
+from fd_mitsuba.export.bake.tangents import vertex_normals, vertex_tangents
+from fd_mitsuba.export.bake.unwrap import padding_for, unwrap
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 SIZE = 256

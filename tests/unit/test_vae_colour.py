@@ -4,7 +4,7 @@ import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
 from fd_mitsuba.guidance.colour_latents import colour_latents, shine
-from fd_mitsuba.prior.vae_colour import build_colour_vae
+from fd_mitsuba.prior.training.vae_colour import build_colour_vae
 
 
 def picture(size: int = 64, seed: int = 0) -> torch.Tensor:

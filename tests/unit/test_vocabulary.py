@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from fd_mitsuba.guidance.vocabulary import Vocabulary, read_prompt
-from fd_mitsuba.prior.captions import PART_WORDS, word_lists
+from fd_mitsuba.prior.data.captions import PART_WORDS, word_lists
 
 
 @pytest.fixture(scope="module")

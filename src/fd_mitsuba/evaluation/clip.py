@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, interpolate, normalize
 
+from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.clip_loading import locate_clip, open_clip, read_clip_conventions, read_preprocessing
-from fd_mitsuba.threads import network_threads
 
 _PICTURES_AT_ONCE = 64
 

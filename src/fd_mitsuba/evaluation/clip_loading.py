@@ -15,7 +15,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.builtin import verify_hashes
 from fd_mitsuba.guidance.layout import first_line, read_json
 
-EVALUATOR_FOLDER = Path(__file__).resolve().parent.parent / "prior" / "evaluator"
+EVALUATOR_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "evaluator"
 BUILTIN_NAME = "built-in evaluator"
 _USUAL = {
     "image_mean": (0.48145466, 0.4578275, 0.40821073),

@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.evaluation.lit_views import some_cameras
-from fd_mitsuba.evaluation.preservation import light_may_be_touched
 from fd_mitsuba.extraction.surface import UnionSurface
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.render.tonemap import to_srgb
+from fd_mitsuba.runs.preservation import light_may_be_touched
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.viewing.lit_views import some_cameras
 
 ELEVATION_DEG, RADIUS, FOV_DEG = 45.0, 3.4, 45.0
 BACKGROUND = 0.35

@@ -13,6 +13,7 @@ from fd_mitsuba import __version__
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.bake.tangents import vertex_tangents
 from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
 from fd_mitsuba.export.cut_shapes import CutBase
 from fd_mitsuba.export.gltf import GltfMesh, glb_bytes, is_placement
@@ -20,13 +21,12 @@ from fd_mitsuba.export.meshes import copy_base
 from fd_mitsuba.export.mitsuba_files import write_mitsuba
 from fd_mitsuba.export.obj import ObjMesh, obj_files
 from fd_mitsuba.export.ready_part import PartAsset, ReadyPart, ready_part
-from fd_mitsuba.export.tangents import vertex_tangents
+from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-from fd_mitsuba.training.checkpoint import write_atomically
 
 FORMATS = ("glb", "obj", "ply", "mitsuba")
 

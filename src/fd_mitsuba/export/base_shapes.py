@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.export.material import PbrMaterial, pbr_material
 from fd_mitsuba.export.pictures import Picture
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
 from fd_mitsuba.scene.mesh_source import ANALYTIC
 from fd_mitsuba.scene.part_stack import StackedPart

@@ -25,7 +25,7 @@ import numpy as np
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instance_glb import instance_glb
-from fd_mitsuba.training.checkpoint import write_atomically
+from fd_mitsuba.io.atomic import write_atomically
 
 _KEYS = {"part", "to_world", "position", "direction", "twist_deg", "scale", "base"}
 MOST_PLACEMENTS = 100_000

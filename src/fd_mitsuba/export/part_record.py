@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fd_mitsuba.export.solid import Solid
+from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from fd_mitsuba.export.bake import TextureSet
+from fd_mitsuba.export.bake.bake import TextureSet
 from fd_mitsuba.scene.scene_file import file_threads
 
 

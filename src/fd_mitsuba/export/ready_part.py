@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.export.bake import Field, bake
+from fd_mitsuba.export.bake.bake import Field, bake
+from fd_mitsuba.export.bake.unwrap import UnwrappedMesh, unwrap
 from fd_mitsuba.export.material import PbrMaterial, pbr_material
 from fd_mitsuba.export.obj import ply_with_uv
 from fd_mitsuba.export.pictures import Picture, exr, part_pictures, png
-from fd_mitsuba.export.unwrap import UnwrappedMesh, unwrap
+from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_material import PartMaterial, part_material
-from fd_mitsuba.training.checkpoint import write_atomically
 
 
 @dataclass(frozen=True)

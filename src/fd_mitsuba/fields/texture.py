@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from fd_mitsuba.config_sections import TextureConfig
+from fd_mitsuba.config.sections import TextureConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, TEXTURE_CHANNELS
 from fd_mitsuba.fields.free_points import features_at
 from fd_mitsuba.fields.hash_grid import HashGrid

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fd_mitsuba.errors import UserError
 
-BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "prior" / "weights"
-APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("weights_appearance")
+BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "shapes"
+APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours")
 SUMS_NAME = "SHA256SUMS"
 
 

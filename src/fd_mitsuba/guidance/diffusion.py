@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
+from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.config_sections import AppearanceConfig
+from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.colour_latents import colour_latents
 from fd_mitsuba.guidance.denoiser import Denoiser
@@ -26,7 +27,6 @@ from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
 from fd_mitsuba.guidance.variants import Chunk, Distillation
-from fd_mitsuba.threads import network_threads
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""

@@ -2,7 +2,7 @@
 
 import sys
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
 
 if "drjit" not in sys.modules:
-    mitsuba_api.choose_llvm()
+    startup.choose_llvm()

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from fd_mitsuba.render import bridge
+from fd_mitsuba.backend import bridge
 from fd_mitsuba.render.appearance_scene import AppearanceScene, Triangles
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.gbuffer import GBuffer, Samples, trace

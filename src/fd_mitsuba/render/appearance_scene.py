@@ -11,11 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from fd_mitsuba.backend.startup import FACES, VERTICES
+from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
-from fd_mitsuba.render.upload import upload_floats, upload_indices
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
 from fd_mitsuba.scene.mesh_source import ANALYTIC
 

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from fd_mitsuba.render.upload import upload_doubles, upload_floats
+from fd_mitsuba.backend.upload import upload_doubles, upload_floats
 from fd_mitsuba.scene.views import CameraBatch
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
-from fd_mitsuba.render import bridge
+from fd_mitsuba.backend import bridge
 from fd_mitsuba.render.appearance_scene import AppearanceScene
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.film_samples import LightNumbers, film_position, light_numbers, opaque_seed

@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import bridge, startup
+from fd_mitsuba.backend.upload import upload_indices
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS
-from fd_mitsuba.render import bridge
 from fd_mitsuba.render.boundary_term import add_boundary_term, upload_points
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.enclosing import is_closed, is_outside
@@ -18,7 +18,6 @@ from fd_mitsuba.render.mesh_tracer import Hit, MeshTracer
 from fd_mitsuba.render.outline_points import sample_outline
 from fd_mitsuba.render.silhouette import find_outline
 from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
-from fd_mitsuba.render.upload import upload_indices
 from fd_mitsuba.render.vertex_normals import area_sums, vertex_normals
 from fd_mitsuba.scene.views import CameraBatch
 
@@ -42,7 +41,7 @@ class GeometryPass:
                 f"size = {size}, spp = {spp}, silhouette_spp = {silhouette_spp}, normal_space = {normal_space!r}: "
                 "sizes and samples must be positive, normal_space camera or world"
             )
-        mitsuba_api.start(mi.variant() or mitsuba_api.DEFAULT_VARIANT)
+        startup.start(mi.variant() or startup.DEFAULT_VARIANT)
         self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
         self._tracer = MeshTracer()
         self._static_sums, self._static_sums_build = torch.zeros(0, 3), 0

@@ -21,10 +21,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
+from fd_mitsuba.backend.startup import FACES, VERTICES
+from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.render.cameras import FilmCamera, FilmCameras
 from fd_mitsuba.render.face_raster import edge_planes, nearest_faces, sort_points
-from fd_mitsuba.render.upload import upload_floats, upload_indices
 
 _POINTS_PER_FACE = 6
 """Up to so many film points for each changing face, faces are drawn.

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from fd_mitsuba.backend.upload import upload_indices
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.mesh_edges import MeshEdges
-from fd_mitsuba.render.upload import upload_indices
 
 _NEAREST_DEPTH = 1e-3
 """Edges are cut off where they come nearer to the camera's plane than this."""

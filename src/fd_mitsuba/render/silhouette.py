@@ -6,10 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from fd_mitsuba.backend.upload import upload_floats
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.mesh_edges import MeshEdges, check_welded, pair_closed, pair_half_edges
 from fd_mitsuba.render.outline import Outline, clip_outline, neighbours
-from fd_mitsuba.render.upload import upload_floats
 
 _VIEWS_AT_ONCE = 32
 """Bits of the number in which a face notes the views that it is turned to."""

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.backend.aligned_memory import aligned
+from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
-from fd_mitsuba.scene.aligned_memory import aligned
 from fd_mitsuba.scene.bsdf_reading import Reading, read_material
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
+from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.scene.tessellate import Arrays, tube, unit_disk, unit_sphere
 
 FILE_SHAPES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
-from fd_mitsuba.mitsuba_api import FACES, VERTICES
 from fd_mitsuba.scene.focal_region import ADD
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, shape_triangles
 from fd_mitsuba.scene.tessellate import Arrays, unit_sphere

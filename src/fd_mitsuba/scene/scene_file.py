@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fd_mitsuba import mitsuba_api
+from fd_mitsuba.backend import startup
+from fd_mitsuba.backend.parser_message import one_line
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.mitsuba_message import one_line
 from fd_mitsuba.scene.plugins import register
 from fd_mitsuba.scene.xml_guard import refuse_plugin_path, scan_scene
 
@@ -22,7 +22,7 @@ MAX_OBJECT_NESTING = 16
 def ready_mitsuba() -> Any:
     """The module `mitsuba` with a variant (the default one if none was chosen) and our plugins."""
     loaded = sys.modules.get("mitsuba")
-    mi = loaded if loaded is not None and loaded.variant() is not None else mitsuba_api.start()
+    mi = loaded if loaded is not None and loaded.variant() is not None else startup.start()
     register(mi)
     return mi
 

@@ -33,10 +33,10 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
-from fd_mitsuba.training.sheets import appearance_sheet
 from fd_mitsuba.training.step_views import check_views, step_views
 from fd_mitsuba.training.style_consistency import StyleConsistency, learn_base_material
 from fd_mitsuba.training.surface_points import points_on
+from fd_mitsuba.viewing.sheets import appearance_sheet
 
 _POOL = 32768
 """Points on the parts' surface that the style losses choose from."""

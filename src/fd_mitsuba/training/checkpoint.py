@@ -8,10 +8,8 @@ Random numbers depend on (seed, step) only, so no generator state is needed for 
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from pathlib import Path
@@ -22,11 +20,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.training.stage import Stage
 
 FORMAT = 1
 _HEADER_KEY = "fd_mitsuba"
-_LITTER = ".tmp"
 
 
 @dataclass(frozen=True)
@@ -72,28 +70,6 @@ def save_checkpoint(
     for other in files[: max(place + 1 - keep, 0)] + files[place + 1 :]:
         other.unlink(missing_ok=True)
     return path
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write bytes to a neighbouring file, flush it to the disk, rename it; UserError where that cannot be done."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{_LITTER}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        reason = error.strerror or error
-        raise UserError(f"{path}: cannot be written ({reason}); free space or choose another -o folder") from None
-
-
-def is_litter(path: Path) -> bool:
-    """Whether a file is what `write_atomically` leaves behind when it is killed."""
-    return path.name.startswith(".") and path.name.endswith(_LITTER)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:

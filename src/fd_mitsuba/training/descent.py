@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.config_sections import AppearanceConfig, GeometryConfig
+from fd_mitsuba.config.sections import AppearanceConfig, GeometryConfig
 from fd_mitsuba.errors import RunStopped
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.config_sections import GeometryConfig
+from fd_mitsuba.config.sections import GeometryConfig
 from fd_mitsuba.extraction.surface import Samples
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.losses.collision import loss_collision

@@ -28,8 +28,8 @@ from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
 from fd_mitsuba.training.seeds import Purpose, seed_for
-from fd_mitsuba.training.sheets import geometry_sheet
 from fd_mitsuba.training.step_views import check_views, step_views
+from fd_mitsuba.viewing.sheets import geometry_sheet
 
 VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""

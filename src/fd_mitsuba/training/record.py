@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import resource
-import sys
 import time
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +13,8 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fd_mitsuba.training.checkpoint import write_atomically
+from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.picture import write_picture
 
 _SHOWN = ("loss_sds", "loss_focal", "loss_collision", "volume_ratio")
 _PLAIN_EVERY_SECONDS = 15.0
@@ -116,19 +114,6 @@ class Recorder:
         path = self._images / f"{prefix}_{step:06d}.png"
         write_picture(path, Image.fromarray(picture))
         return path
-
-
-def write_picture(path: Path, image: Image.Image) -> None:
-    """Write a PNG, whole or not at all; UserError if the folder cannot be written."""
-    data = io.BytesIO()
-    image.save(data, format="PNG")
-    write_atomically(path, data.getvalue())
-
-
-def peak_memory_mb() -> int:
-    """The most memory that this process has held so far, in units of 2^20 bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
 def _short(value: float) -> float:

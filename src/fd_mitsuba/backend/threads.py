@@ -1,0 +1,103 @@
+"""How the renderer and torch share the processor's cores and memory: decided in one place, before a run starts.
+
+Both keep a pool of threads of their own, and a step hands over between them a few hundred times. Threads that wait by
+spinning then take the core that the other pool needs: with both pools on two cores a step takes several times as long
+as with one thread each. So
+
+* OpenMP's idle threads sleep (`OMP_WAIT_POLICY=PASSIVE`, which counts only if it is set before torch is loaded);
+* torch runs the small operations of a geometry step on one thread, and takes more only inside `network_threads()`,
+  around a diffusion model;
+* Dr.Jit stays on one thread where there are at most two cores: a second one made a quiet machine's step a fifth faster
+  at best, and 1.5 to 2.7 times as slow as soon as anything else ran. With more cores it leaves one to the rest.
+
+Each step also makes and drops arrays of some ten megabytes. The allocator is told to keep them instead of handing them
+back to the system, which would clear them again page by page: 8 % of a step on the grid of 128 cells a side.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from fd_mitsuba.backend.startup import DEFAULT_VARIANT, start
+
+_FEW_CORES = 2
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
+_KEPT_BYTES = 1 << 29
+_cores: int | None = None
+
+
+def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
+    """Start Mitsuba, set all thread counts and the allocator. Call once per process, before anything imports torch.
+
+    Args:
+        threads: cores to use; 0: all that this process may run on. 1 gives every pool one thread, and so results that
+            are the same bytes at every run.
+        variant: Mitsuba's variant.
+
+    Raises:
+        UserError: as `startup.start`.
+    """
+    global _cores
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    cores = threads or available_cores()
+    start(variant, threads if threads < 0 else renderer_threads(cores))
+    import torch
+
+    torch.set_num_threads(1)
+    _cores = cores
+    _keep_freed_memory()
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def renderer_threads(cores: int) -> int:
+    """Dr.Jit's share of `cores`."""
+    return 1 if cores <= _FEW_CORES else cores - 1
+
+
+@contextmanager
+def network_threads() -> Iterator[None]:
+    """While open, torch uses all the cores given to `share_cores`; without that call nothing changes."""
+    import torch
+
+    with _all_cores(torch.get_num_threads, torch.set_num_threads):
+        yield
+
+
+@contextmanager
+def rendering_threads() -> Iterator[None]:
+    """While open, Dr.Jit has all the cores given to `share_cores`, for pictures that are rendered in one go.
+
+    In the steps of a run a second thread of two is more in the way than it helps; a turntable takes 0.6 to 0.8 of the
+    time with it, and shows the same.
+    """
+    import drjit as dr
+
+    with _all_cores(dr.thread_count, dr.set_thread_count):
+        yield
+
+
+@contextmanager
+def _all_cores(count: Callable[[], int], change: Callable[[int], None]) -> Iterator[None]:
+    before = count()
+    if _cores is not None:
+        change(_cores)
+    try:
+        yield
+    finally:
+        change(before)
+
+
+def _keep_freed_memory() -> None:
+    """Up to half a gigabyte stays with the process; an allocator other than glibc's is left as it is."""
+    with contextlib.suppress(AttributeError, OSError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
+        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)

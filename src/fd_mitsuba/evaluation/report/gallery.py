@@ -1,0 +1,135 @@
+"""One page over many runs: pictures before and after, prompts and figures in a table, and links to the reports."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fd_mitsuba.evaluation.report.metric_table import duration
+from fd_mitsuba.evaluation.report.run_page import PAGE, page_template, turntables
+from fd_mitsuba.evaluation.report.run_record import RunRecord, read_run
+from fd_mitsuba.evaluation.report.score_table import COLUMNS
+from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.viewing.film_strip import Strip, common_crop, strip
+
+_THUMB_FRAMES, _THUMB_SIZE = 12, 160
+_EVALUATED = ("sim", "dir", "dir_cosine", "rank", "rank_part", "valid")
+
+
+class Cell(NamedTuple):
+    """A figure as a number to sort by, and as text."""
+
+    value: float | None
+    text: str
+
+
+class GalleryRow(NamedTuple):
+    """A run."""
+
+    name: str
+    link: str | None
+    prompt: str
+    state: str
+    finished: bool
+    before: Strip | None
+    after: Strip | None
+    cells: list[Cell]
+
+
+class _Column(NamedTuple):
+    title: str
+    value: Callable[[RunRecord], float | None]
+    text: Callable[[float], str]
+
+
+def _metric(name: str, group: str | None = None) -> Callable[[RunRecord], float | None]:
+    def value(run: RunRecord) -> float | None:
+        holder = run.metrics if group is None else run.metrics.get(group, {})
+        found = holder.get(name)
+        return float(found) if isinstance(found, int | float) else None
+
+    return value
+
+
+def _evaluated(key: str) -> _Column:
+    column = COLUMNS[key]
+
+    def value(run: RunRecord) -> float | None:
+        try:
+            return column.value(run.evaluation) if run.evaluation else None
+        except (TypeError, ValueError, KeyError, AttributeError):
+            return None
+
+    return _Column(column.title, value, column.text)
+
+
+_OWN = (
+    _Column("seed", lambda run: run.settings.get("seed"), "{:.0f}".format),
+    _Column("inside region", _metric("inside_fraction"), "{:.1%}".format),
+    _Column("overlap", _metric("overlap_fraction"), "{:.1%}".format),
+    _Column("base PSNR, dB", _metric("base_psnr_db", "appearance"), "{:.0f}".format),
+    _Column("time", lambda run: sum(run.seconds().values()) or None, duration),
+)
+
+
+def write_gallery(folders: Sequence[Path], path: Path, title: str = "Runs") -> Path:
+    """Write the page; returns its path.
+
+    Args:
+        folders: run folders, finished or not. Each is linked to its `report.html` where there is one.
+
+    Raises:
+        UserError: one of them is no run, or the page cannot be written.
+    """
+    runs = [read_run(folder) for folder in folders]
+    columns = [*_OWN, *(_evaluated(key) for key in _EVALUATED)]
+    columns = [column for column in columns if any(column.value(run) is not None for run in runs)]
+    rows = [_row(run, columns, path.resolve().parent) for run in runs]
+    clips = [run.evaluation.get("clip") for run in runs]
+    judges = sorted({str(clip.get("judge")) for clip in clips if isinstance(clip, dict) and clip.get("judge")})
+    text = page_template("gallery.html.j2").render(
+        title=title,
+        css=(PAGE / "page.css").read_text(encoding="utf-8"),
+        js=(PAGE / "gallery.js").read_text(encoding="utf-8"),
+        rows=rows,
+        columns=[column.title for column in columns],
+        finished=sum(run.finished for run in runs),
+        means=_means(columns, rows) if len(rows) > 1 else None,
+        judges=judges,
+    )
+    write_atomically(path, text.encode())
+    return path
+
+
+def _row(run: RunRecord, columns: Sequence[_Column], root: Path) -> GalleryRow:
+    report = run.folder / "report.html"
+    link = Path(os.path.relpath(report.resolve(), root)).as_posix() if report.is_file() else None
+    before, after = _thumbs(run.folder)
+    values = [column.value(run) for column in columns]
+    cells = [
+        Cell(value, "-" if value is None else column.text(value)) for column, value in zip(columns, values, strict=True)
+    ]
+    return GalleryRow(run.folder.resolve().name, link, run.prompt, run.state, run.finished, before, after, cells)
+
+
+def _thumbs(folder: Path) -> tuple[Strip | None, Strip | None]:
+    found = turntables(folder)
+    if not found:
+        return None, None
+    _, _, before, after = found[0]
+    crop = common_crop(before, after)
+    chosen = np.linspace(0, len(after), min(_THUMB_FRAMES, len(after)), endpoint=False).astype(int)
+    return strip(before[chosen], crop, _THUMB_SIZE), strip(after[chosen], crop, _THUMB_SIZE)
+
+
+def _means(columns: Sequence[_Column], rows: Sequence[GalleryRow]) -> list[Cell]:
+    means = []
+    for number, column in enumerate(columns):
+        values = [row.cells[number].value for row in rows if row.cells[number].value is not None]
+        mean = sum(values) / len(values) if values and column.title != "seed" else None
+        means.append(Cell(mean, "" if mean is None else column.text(mean)))
+    return means

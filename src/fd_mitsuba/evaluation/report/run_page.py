@@ -1,0 +1,229 @@
+"""`RUN/report.html`: one page that shows a run, self-contained: it loads nothing and opens from anywhere."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader
+from PIL import Image
+
+from fd_mitsuba.errors import Interrupted, RunStopped
+from fd_mitsuba.evaluation.report.curves import stage_curves
+from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
+from fd_mitsuba.evaluation.report.run_record import RunRecord, changed_settings, read_run
+from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, sheet_row, strip, video_frames
+
+PAGE = Path(__file__).with_name("page")
+_MOST_GLB_BYTES = 9 << 20
+_STEPS_SHOWN = 6
+_SHEETS = {"appearance": "The material's maps", "turntable": "The shape, from eight sides"}
+
+
+class Pair(NamedTuple):
+    """Two turntables with the same views."""
+
+    name: str
+    title: str
+    before: Strip
+    after: Strip
+
+
+class Titled(NamedTuple):
+    """A picture's data URI, or a figure's text, and what it is."""
+
+    title: str
+    uri: str = ""
+    text: str = ""
+
+
+def write_report(folder: Path) -> Path:
+    """Write the report of a run, finished or not, from what lies in its folder; returns its path.
+
+    Raises:
+        UserError: no run there, or the page cannot be written.
+    """
+    run = read_run(folder)
+    part = _film(folder, "turntable_part", "turntable", 3)
+    glb, glb_note = _glb(folder)
+    text = page_template("report.html.j2").render(
+        run=run,
+        css=(PAGE / "page.css").read_text(encoding="utf-8"),
+        js=(PAGE / "viewer.js").read_text(encoding="utf-8"),
+        chips=_chips(run),
+        pairs=_pairs(folder),
+        part=None if part is None else strip(part, common_crop(part)),
+        part_files=", ".join(f"export/{path.name}" for path in sorted((folder / "export").glob("part_*.ply"))),
+        tiles=_tiles(run),
+        glb=glb,
+        glb_note=glb_note,
+        viewer_script=viewer_script(),
+        steps=_steps(folder),
+        sheets=_sheets(folder),
+        charts={stage: stage_curves(rows) for stage, rows in run.rows.items()},
+        evaluation=figure_tables(run.evaluation, "evaluation"),
+        metrics=figure_tables(run.metrics, "geometry"),
+        timings=figure_tables(_timings(run), "timings"),
+        settings=figure_tables(run.settings, "run", settings=True),
+        changed=changed_settings(run.settings),
+        origin=figure_tables({"scene": run.identity, "environment": run.environment}, "run"),
+    )
+    path = folder / "report.html"
+    write_atomically(path, text.encode())
+    return path
+
+
+@contextmanager
+def reported(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Around a run: its report is written at the end, also when the run was interrupted or had to stop.
+
+    A report that fails is one line to `say`: it must not fail the run.
+    """
+    try:
+        yield
+    except (Interrupted, RunStopped):
+        report_or_say(folder, say)
+        raise
+    report_or_say(folder, say)
+
+
+def report_or_say(folder: Path, say: Callable[[str], None]) -> None:
+    """`write_report` where there is a run; whatever goes wrong becomes one line."""
+    if not (folder / "run.json").is_file():
+        return
+    try:
+        write_report(folder)
+    except Exception as error:
+        say(" ".join(f"{folder}: no report ({type(error).__name__}: {error}); the run itself is complete".split()))
+
+
+@cache
+def page_template(name: str):
+    """A template of the pages; everything put into it is escaped unless it says `safe`."""
+    return Environment(
+        loader=FileSystemLoader(PAGE), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    ).get_template(name)
+
+
+def viewer_script() -> str | None:
+    """The script of `<model-viewer>`; None where this installation has no copy."""
+    path = PAGE / "model_viewer" / "model-viewer.min.js"
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def turntables(folder: Path) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
+    """(name, title, frames before, frames after), as many of each: lit, then shape, where there are pictures of it."""
+    found = []
+    for name, title, row in (("appearance", "In its light", 1), ("turntable", "Shape", 2)):
+        after, before = (video_frames(folder / "videos" / f"{file}.mp4") for file in (name, f"{name}_base"))
+        if after is None or before is None or after.shape != before.shape:
+            before, after = (sheet_row(folder / "images" / f"{name}.png", number) for number in (0, row))
+        if before is not None and after is not None:
+            found.append((name, title, before, after))
+    return found
+
+
+def _pairs(folder: Path) -> list[Pair]:
+    pairs = []
+    for name, title, before, after in turntables(folder):
+        crop = common_crop(before, after)
+        pairs.append(Pair(name, title, strip(before, crop), strip(after, crop)))
+    return pairs
+
+
+def _film(folder: Path, video: str, sheet: str, row: int) -> np.ndarray | None:
+    frames = video_frames(folder / "videos" / f"{video}.mp4")
+    return sheet_row(folder / "images" / f"{sheet}.png", row) if frames is None else frames
+
+
+def _glb(folder: Path) -> tuple[str | None, str]:
+    """The asset in base 64, and why not where it is not shown."""
+    path = folder / "export" / "asset.glb"
+    if not path.is_file():
+        return None, ""
+    if path.stat().st_size > _MOST_GLB_BYTES:
+        return (
+            None,
+            f"export/asset.glb ({path.stat().st_size >> 20} MB) is too large for this page; open the file itself.",
+        )
+    if viewer_script() is None:
+        return None, "This installation has no copy of model-viewer; open export/asset.glb in any viewer of glTF."
+    return base64.b64encode(path.read_bytes()).decode(), ""
+
+
+def _chips(run: RunRecord) -> list[str]:
+    guidance = run.settings.get("guidance")
+    model = guidance.get("model") if isinstance(guidance, dict) else None
+    return [
+        *([f"seed {run.settings['seed']}"] if "seed" in run.settings else []),
+        *([f"guidance: {model}"] if model else []),
+        *(f"{name} {rows[-1].get('step')} steps" for name, rows in run.rows.items() if rows),
+    ]
+
+
+def _tiles(run: RunRecord) -> list[Titled]:
+    metrics, tiles = run.metrics, []
+
+    def tile(name: str, title: str, form: Callable[[float], str]) -> None:
+        value = metrics.get(name, metrics.get("appearance", {}).get(name))
+        if isinstance(value, int | float):
+            tiles.append(Titled(title, text=form(value)))
+
+    tile("inside_fraction", "of the part inside its region", "{:.1%}".format)
+    tile("overlap_fraction", "of the part inside the base", "{:.1%}".format)
+    tile("base_identical", "base unchanged, byte for byte", lambda value: "yes" if value else "no")
+    tile("base_psnr_db", "base outside the part, PSNR", lambda value: "exact" if value >= 199 else f"{value:.0f} dB")
+    faces = metrics.get("part_faces")
+    if isinstance(faces, dict) and faces:
+        tiles.append(Titled("faces of the part", text=f"{sum(faces.values()):,}"))
+    clip = run.evaluation.get("clip")
+    if isinstance(clip, dict):
+        for name, title in (("sim", "CLIP similarity"), ("dir_dot", "CLIP direction")):
+            if isinstance(clip.get(name), float):
+                tiles.append(Titled(f"{title}, judge {clip.get('judge', 'unknown')}", text=f"{clip[name]:.3f}"))
+    spent = sum(run.seconds().values())
+    if spent:
+        tiles.append(Titled("in the steps of all stages", text=duration(spent)))
+    return tiles
+
+
+def _timings(run: RunRecord) -> dict[str, str]:
+    found = {}
+    for stage, seconds in run.seconds().items():
+        count = len(run.rows[stage])
+        found[f"{stage} steps"] = f"{duration(seconds)} ({count} steps, {seconds / max(count, 1):.2f} s each)"
+    if isinstance(run.metrics.get("seconds"), int | float):
+        found["last session, pictures and exports included"] = duration(run.metrics["seconds"])
+    return found
+
+
+def _steps(folder: Path) -> list[Titled]:
+    """Contact sheets along the way, evenly chosen, the last of each stage among them."""
+    found = []
+    for prefix, stage in (("step", "geometry"), ("appearance", "appearance")):
+        paths = sorted(p for p in (folder / "images").glob(f"{prefix}_*.png") if re.search(r"_\d{6}$", p.stem))
+        chosen = {round(place) for place in np.linspace(0, len(paths) - 1, min(_STEPS_SHOWN, len(paths)))}
+        for path in (paths[number] for number in sorted(chosen)):
+            if (uri := _picture(path, 720)) is not None:
+                found.append(Titled(f"{stage}, step {int(path.stem.rpartition('_')[2])}", uri))
+    return found
+
+
+def _sheets(folder: Path) -> list[Titled]:
+    pictures = {title: _picture(folder / "images" / f"{name}.png", 1536) for name, title in _SHEETS.items()}
+    return [Titled(title, uri) for title, uri in pictures.items() if uri is not None]
+
+
+def _picture(path: Path, widest: int) -> str | None:
+    try:
+        with Image.open(path) as image:
+            return picture_uri(image, widest)
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,158 @@
+"""Evaluate finished runs: from a run folder to `evaluation.json`. The figures are defined in docs/evaluation.md."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from PIL import Image
+
+from fd_mitsuba.backend.threads import rendering_threads
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.evaluation.boundary_step import boundary_step
+from fd_mitsuba.evaluation.judged_views import JudgedViews, lit_views, shape_views
+from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
+from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
+from fd_mitsuba.evaluation.similarity import EditPrompt, Judge
+from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
+from fd_mitsuba.guidance.model_conventions import read_model_conventions
+from fd_mitsuba.guidance.vocabulary import Vocabulary
+from fd_mitsuba.io.json_object import read_json_object, write_json
+from fd_mitsuba.io.picture import write_picture
+from fd_mitsuba.runs.appearance_outcome import finished_appearance
+from fd_mitsuba.runs.geometry_outcome import load_finished_stage
+from fd_mitsuba.runs.saved_run import saved_run
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.viewing.sheets import as_bytes
+
+RESULT_NAME = "evaluation.json"
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How to look: the paper's 100 views unless said otherwise.
+
+    Attributes:
+        views: on the ring.
+        size: pixels a side.
+        spp: samples a pixel of lit pictures; normals take a fixed number.
+        pictures: `auto` is `lit` where the run has an appearance, else `shape`: what the judge wants of a bare shape.
+    """
+
+    views: int = 100
+    size: int = 96
+    spp: int = 16
+    pictures: Literal["auto", "lit", "shape"] = "auto"
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or self.size < 16 or self.spp < 1:
+            raise UserError(f"--views {self.views} --size {self.size} --spp {self.spp}: give at least 1, 16 and 1")
+
+
+def evaluate_run(
+    folder: Path,
+    judge: Judge,
+    protocol: Protocol | None = None,
+    rivals: Sequence[ScenePrompts] = (),
+    again: bool = False,
+) -> dict:
+    """The figures of one run, which are also written to `folder/evaluation.json`, or `evaluation_shape.json` where
+    pictures of the bare shape were asked for; views are shown in `folder/images` under the same name.
+
+    Args:
+        rivals: the scenes whose edit prompts the run's own has to be found among. If the built-in models know every
+            word of the run's prompt, only the scenes of which that is true count.
+        again: also if a result of the same run, judge, protocol and rivals is there already.
+
+    Raises:
+        UserError: no finished run there, or pictures that it cannot give.
+    """
+    protocol, started = protocol or Protocol(), time.monotonic()
+    if not (folder / "metrics.json").is_file():
+        raise UserError(f"{folder}: no metrics.json; give the -o folder of a finished run")
+    path = folder / (RESULT_NAME if protocol.pictures != "shape" else "evaluation_shape.json")
+    key = _key(folder, judge, protocol, rivals)
+    known = read_json_object(path) or {}
+    if not again and known.get("key") == key:
+        return known
+    scene, config = saved_run(folder)
+    appearance = None if protocol.pictures == "shape" else finished_appearance(scene, config, folder)
+    if appearance is None and protocol.pictures == "lit":
+        raise UserError(f"{folder}: its appearance stage has not begun; evaluate its shape instead")
+    if appearance is not None:
+        with rendering_threads():
+            views = lit_views(appearance, protocol.views, protocol.size, protocol.spp)
+    else:
+        stage = load_finished_stage(scene, config, folder)
+        with rendering_threads():
+            views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
+    vocabulary = builtin_vocabulary()
+    own, simple = _words(scene)
+    known_to_builtin = vocabulary is not None and ScenePrompts(scene.path, own, simple).known_to(vocabulary)
+    among = [rival.words for rival in rivals if not known_to_builtin or rival.known_to(vocabulary)]
+    result = {
+        "format": FORMAT,
+        "key": key,
+        "run": str(folder),
+        "scene": scene.path.resolve().parent.name,
+        "prompt": own.prompt,
+        "base_prompt": own.base_prompt,
+        "seed": config.seed,
+        "guidance_model": config.guidance.model,
+        "steps": [config.geometry.steps, None if appearance is None else config.appearance.steps],
+        "judge": judge.name,
+        "views": about_views(views),
+        **judged(views, judge, own, simple, among, vocabulary if known_to_builtin else None),
+        **measured(scene, folder, views),
+    }
+    if appearance is not None and not scene.subtracts:
+        reach = config.appearance.boundary_reach
+        step = boundary_step(scene, appearance.parts.values(), appearance.field, reach)
+        result["boundary"] = {"colour_step": step, "reach": reach}
+    result["evaluation_seconds"] = round(time.monotonic() - started, 1)
+    write_json(path, result)
+    write_picture(folder / "images" / f"{path.stem}.png", Image.fromarray(views_sheet(views)))
+    return result
+
+
+def views_sheet(views: JudgedViews) -> np.ndarray:
+    """Eight of the views: rows base, start, edited; (3 S, 8 S, 3) uint8."""
+    chosen = np.linspace(0, len(views.edited), min(_SHOWN, len(views.edited)), endpoint=False).astype(int)
+    rows = [as_bytes(pictures[chosen]) for pictures in (views.base, views.start, views.edited)]
+    return np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+
+
+def builtin_vocabulary() -> Vocabulary | None:
+    """The words of the built-in prior; None if this installation has none."""
+    return vocabulary_of("builtin")
+
+
+def vocabulary_of(model: str) -> Vocabulary | None:
+    """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion."""
+    folder = BUILTIN_FOLDER if model == "builtin" else Path(model)
+    return read_model_conventions(folder).vocabulary if folder.is_dir() else None
+
+
+def _shape_kind(judge: Judge) -> Literal["normals", "shaded"]:
+    return "normals" if judge.geometry_pictures == "normals" else "shaded"
+
+
+def _words(scene: EditScene) -> tuple[EditPrompt, str | None]:
+    """The run's own, and the simplified prompt where the scene's file has one for this very prompt."""
+    words = EditPrompt(scene.prompt, scene.base_prompt)
+    said = prompts_of_scene(scene.path, scene.parameters)
+    return words, said.simple if said is not None and said.words.prompt == scene.prompt else None
+
+
+def _key(folder: Path, judge: Judge, protocol: Protocol, rivals: Sequence[ScenePrompts]) -> str:
+    """Changes with whatever the result depends on."""
+    digest = hashlib.sha256((folder / "metrics.json").read_bytes())
+    among = [(rival.name, rival.words) for rival in rivals]
+    digest.update(repr((FORMAT, judge.name, judge.version, protocol, among)).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,128 @@
+"""What the appearance prior paints on its own: sampled mosaics, and whether their colours are the prompted ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config.sections import AppearanceConfig
+from fd_mitsuba.guidance.diffusion import MASK_THRESHOLD, DiffusionGuidance
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.captions import BODY_WORDS, MATERIALS, PART_WORDS, styled, view_words
+from fd_mitsuba.prior.data.looks import NAMED, cielab
+from fd_mitsuba.prior.judging.evaluate import UNSEEN_SEED, draw_samples
+from fd_mitsuba.prior.pictures.colour_corpus import PartView, part_views
+from fd_mitsuba.prior.pictures.light import Light, lit_by, random_environment
+
+_ON_PART = 128
+"""Pixels that the part covers by half or more (of 255) are counted."""
+
+
+@dataclass(frozen=True)
+class ColourFigure:
+    """One sample: which of the anchors, painted on the same part under the same light, its mean colour is nearest to.
+
+    `error` is the distance in CIELAB to the prompted one.
+    """
+
+    body: str
+    part: str
+    style: str
+    nearest: str
+    error: float
+
+
+def evaluate_colours(
+    folder: Path,
+    output: Path,
+    cases: Sequence[tuple[str, str, str]],
+    seed: int = 0,
+    steps: int = 12,
+    scale: float = 1.5,
+) -> list[ColourFigure]:
+    """Write `output` (a row each of clay, truth, sample for twelve cases) and measure.
+
+    Args:
+        folder: a packed pipeline folder of the appearance prior.
+        cases: (body, part, style); a style is a key of `NAMED`.
+        steps, scale: of DDIM, and of the text guidance.
+    """
+    guidance = DiffusionGuidance.load(
+        GuidanceConfig(model=str(folder), views_per_call=16), appearance=AppearanceConfig()
+    )
+    clay, truths, coverages, captions = [], [], [], []
+    for number, (body, part, style) in enumerate(cases):
+        rng = np.random.default_rng([UNSEEN_SEED, seed, number])
+        light = lit_by(random_environment(rng))
+        views = list(part_views(body, [part], rng))
+        view = views[number % len(views)]
+        painted = {name: _painted(view, name, light, number) for name in NAMED}
+        clay.append(painted[style][0])
+        truths.append({name: picture[1] for name, picture in painted.items()})
+        coverages.append(painted[style][2])
+        captions.append(f"{prompt(body, part, style)}, {view_words(view.camera.azimuth_deg, view.closeup)}")
+    base = torch.from_numpy(np.stack(clay)).float() / 127
+    # As the guidance works: noise on the part alone.
+    mask = torch.from_numpy(np.stack(coverages)[:, None] > 255 * MASK_THRESHOLD).float()
+    samples = torch.cat(
+        [
+            draw_samples(guidance, base[i : i + 8], captions[i : i + 8], seed + i, steps, scale, mask[i : i + 8])
+            for i in range(0, len(base), 8)
+        ]
+    ).numpy()
+    figures = []
+    for case, truth, sample, coverage in zip(cases, truths, samples, coverages, strict=True):
+        on_part = coverage >= _ON_PART
+        means = {name: _mean_lab(latent / 127, on_part) for name, latent in truth.items()}
+        drawn = _mean_lab(sample, on_part)
+        nearest = min(means, key=lambda name: float(np.linalg.norm(means[name] - drawn)))
+        figures.append(ColourFigure(*case, nearest, float(np.linalg.norm(means[case[2]] - drawn))))
+    wanted = [truth[case[2]] / 127 for truth, case in zip(truths, cases, strict=True)]
+    write_sheet(output, [[picture / 127 for picture in clay], wanted, list(samples)])
+    return figures
+
+
+def prompt(body: str, part: str, style: str) -> str:
+    """The plainest sentence for a body with a part in a style."""
+    word = MATERIALS[style][0] if style in MATERIALS else style
+    return f"a {BODY_WORDS[body][0]} with {styled(PART_WORDS[part][0], word)}"
+
+
+def colours(latent: np.ndarray) -> np.ndarray:
+    """sRGB (H, W, 3) in [0, 1] of a latent (4, H, W)."""
+    return np.clip((latent[:3] + 1) / 2, 0, 1).transpose(1, 2, 0)
+
+
+def write_sheet(output: Path, rows: list[list[np.ndarray]], columns: int = 12, zoom: int = 2) -> None:
+    """Write latents (4, 64, 64) as pictures, the rows under each other, `columns` to a line."""
+    lines = []
+    for start in range(0, len(rows[0]), columns):
+        for row in rows:
+            pictures = [colours(latent) for latent in row[start : start + columns]]
+            pictures += [np.zeros((64, 64, 3))] * (columns - len(pictures))
+            lines.append(np.concatenate(pictures, axis=1))
+    sheet = Image.fromarray(np.rint(255 * np.concatenate(lines)).astype(np.uint8))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    sheet.resize((sheet.width * zoom, sheet.height * zoom), Image.Resampling.NEAREST).save(output)
+
+
+def _painted(view: PartView, style: str, light: Light, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return view.paint((NAMED[style],), None, light, np.random.default_rng([UNSEEN_SEED, seed]))
+
+
+def _mean_lab(latent: np.ndarray, where: np.ndarray) -> np.ndarray:
+    return cielab(colours(latent)[where].mean(0))
+
+
+def balanced_cases(count: int, seed: int = 0) -> list[tuple[str, str, str]]:
+    """`count` cases in which all styles, parts and bodies come about equally often."""
+    rng = np.random.default_rng(seed)
+    lists = [[str(name) for _ in range(-(-count // len(names))) for name in rng.permutation(list(names))]
+             for names in (BODIES, PART_WORDS, NAMED)]  # fmt: skip
+    return list(zip(*(names[:count] for names in lists), strict=True))

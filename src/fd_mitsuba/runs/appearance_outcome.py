@@ -1,0 +1,217 @@
+"""The appearance stage of a run folder: from its parts' meshes to learned materials, pictures and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.part_record import part_file
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.io.picture import write_picture
+from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.runs.preservation import measure_preservation
+from fd_mitsuba.runs.saved_run import saved_run
+from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.mesh_source import shape_triangles
+from fd_mitsuba.scene.part_material import part_material
+from fd_mitsuba.scene.region_mode import cut_faces_name
+from fd_mitsuba.scene.scene_file import ready_mitsuba
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.training.appearance_stage import AppearanceStage
+from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
+from fd_mitsuba.training.step_views import check_views
+from fd_mitsuba.viewing.lit_views import lit_ring, ring_cameras
+from fd_mitsuba.viewing.sheets import map_rows
+from fd_mitsuba.viewing.turntable import write_sheet, write_video
+
+_SHEET_VIEWS = 8
+_VIDEO_SPP, _SHEET_SPP = 12, 32
+_BRIGHTEST_BOUNCE = 1.0
+"""What a sample may see by way of another surface in the pictures of `render_run`, in units of the picture's white."""
+CUTS_UNKNOWN = (
+    "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "
+    "appearance.style=true for faces that go on with the base's material, or guidance.model to a Stable Diffusion model"
+)
+
+
+def parts_of_run(scene: EditScene, folder: Path) -> dict[str, TriangleMesh]:
+    """The parts' meshes that the geometry stage exported, canonical frame; where they are cut out, the cut's faces.
+
+    Raises:
+        UserError: a part is missing or empty.
+    """
+    parts = {}
+    for name in scene.parts:
+        path = folder / "export" / (f"{cut_faces_name(name)}.ply" if scene.subtracts else part_file(name))
+        if not path.is_file():
+            raise UserError(f"{path}: missing; run the geometry stage first (--stage geometry)")
+        vertices, faces = _triangles(path)
+        parts[name] = TriangleMesh(name, scene.frame.to_canonical(vertices), faces, (path,))
+    return parts
+
+
+def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None:
+    """Where parts are cut out: number of a base shape -> the exported mesh of what is left of it without the faces of
+    the cut; None: nothing. None for scenes that do not cut.
+
+    Raises:
+        UserError: the geometry stage has not been exported, or a file of it is gone.
+    """
+    if not scene.subtracts:
+        return None
+    record = folder / "export" / "part.json"
+    try:
+        names = json.loads(record.read_text(encoding="utf-8"))["opened"]
+        opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
+    except (OSError, ValueError, KeyError):
+        raise UserError(f"{record}: does not say what is left of the base; run the geometry stage anew") from None
+    for path in opened.values():
+        if path is not None and not path.is_file():
+            raise UserError(f"{path}: missing; run the geometry stage anew (--stage geometry)")
+    return opened
+
+
+def _removed(scene: EditScene, folder: Path) -> list[np.ndarray] | None:
+    """Vertices (V, 3) of what was cut out, user frame; None for scenes that do not cut."""
+    paths = [folder / "export" / part_file(name) for name in scene.parts]
+    return [_triangles(path)[0] for path in paths if path.is_file()] if scene.subtracts else None
+
+
+def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    return shape_triangles(ready_mitsuba(), "ply", {"filename": str(path)}, np.eye(4))
+
+
+def prepare_appearance(
+    scene: EditScene,
+    config: RunConfig,
+    say: Callable[[str], None],
+    say_of_prompt: Callable[[str], None],
+    shared: DiffusionGuidance | None = None,
+) -> DiffusionGuidance | None:
+    """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
+
+    Args:
+        say: takes remarks about the scene, `say_of_prompt` those about the prompt's words.
+        shared: the geometry stage's guidance, so that a large model is loaded once.
+
+    Raises:
+        UserError: see `check_appearance_inputs`, `part_material`, `DiffusionGuidance.load`, `check_views` and
+            `take_prompt`.
+    """
+    for warning in check_appearance_inputs(scene):
+        say(warning)
+    # The stage asks again, but only after the shape is there: nobody shall wait for that to hear of a wrong material.
+    part_material(scene, config.appearance.fixed, config.appearance.normal_map)
+    if config.appearance.lambda_sds == 0:
+        return None
+    if shared is None:
+        guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
+    else:
+        guidance = shared.for_appearance(config.appearance)
+    if guidance.conventions.vocabulary is not None and scene.subtracts:
+        raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
+    check_views(AppearanceStage.name, config, guidance)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt)
+    return guidance
+
+
+def finished_appearance(
+    scene: EditScene, config: RunConfig, folder: Path, max_depth: int | None = None
+) -> AppearanceStage | None:
+    """The appearance stage of a run at its newest checkpoint, without guidance; None if it has not begun.
+
+    Args:
+        max_depth: for pictures with more bounces of light than the stage was trained with.
+
+    Raises:
+        UserError: parts are missing, or every checkpoint is damaged.
+    """
+    if not list_checkpoints(checkpoint_folder(folder, AppearanceStage.name)):
+        return None
+    config_hash = config.content_hash(AppearanceStage.name)
+    if max_depth is not None:
+        config = config.model_copy(update={"appearance": config.appearance.model_copy(update={"max_depth": max_depth})})
+    parts, opened = parts_of_run(scene, folder), opened_base(scene, folder)
+    stage = AppearanceStage(scene, config, parts, None, lambda line: None, opened)
+    load_trained(folder, stage, config_hash)
+    return stage
+
+
+def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
+    """Write the lit turntable, before and after, and the maps; returns the measured figures."""
+    output, rendering = stage.config.output, stage.rendering
+    alone = AppearancePass(stage.scene, {}, stage.shading, rendering.size, rendering.spp)
+    video = lit_turntable(stage, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
+    write_video(video, folder / "videos" / "appearance.mp4")
+    around = ring_cameras(output.turntable_frames, stage.aim)
+    before = lit_ring(alone, alone.render_base, around, stage.exposure, output.turntable_size, _VIDEO_SPP)
+    write_video(before, folder / "videos" / "appearance_base.mp4")
+    cameras, size = ring_cameras(_SHEET_VIEWS, stage.aim), min(output.turntable_size, 192)
+    rows = {
+        "base": lit_ring(alone, alone.render_base, cameras, stage.exposure, size, _SHEET_SPP),
+        f"result: {stage.scene.prompt}": lit_turntable(stage, _SHEET_VIEWS, size, _SHEET_SPP),
+    }
+    with torch.no_grad():
+        gbuffer = rendering.trace(cameras, 0, size=size, spp=_VIDEO_SPP)
+        texture = stage.texture(gbuffer)
+        pictures = stage.render(gbuffer, texture, 0)
+    maps = map_rows(gbuffer, pictures, texture, stage.exposure)
+    del maps["merged"]  # at few samples; the result's own row has more
+    write_sheet({**rows, **maps}, folder / "images" / "appearance.png")
+    kept = measure_preservation(rendering, alone, cameras, stage.exposure, 128, 16, _removed(stage.scene, folder))
+    return {
+        **asdict(kept),
+        "exposure": stage.exposure,
+        "learned": list(stage.material.learned),
+        **stage.check_field(stage.steps),
+    }
+
+
+def lit_turntable(stage: AppearanceStage, count: int, size: int, spp: int) -> np.ndarray:
+    """Frames (count, size, size, 3) uint8 of the finished object, front first."""
+
+    def shade(gbuffer: GBuffer, seed: int) -> torch.Tensor:
+        return stage.render(gbuffer, stage.texture(gbuffer), seed).merged
+
+    return lit_ring(stage.rendering, shade, ring_cameras(count, stage.aim), stage.exposure, size, spp)
+
+
+def render_run(
+    folder: Path, changed: dict[str, str], name: str, views: int, size: int, spp: int, max_depth: int
+) -> list[Path]:
+    """Render a run's object all around, with other values for the scene's `$name`, such as another light.
+
+    Writes `renders/<name>_NN.png` and the sheet `renders/<name>.png` below `folder` and returns their paths. The
+    exposure is the run's own rule applied to the light at hand.
+
+    Raises:
+        UserError: no run, no appearance checkpoint, a size or count out of range, and see `load_edit_scene`.
+    """
+    if views < 1 or size < 16 or spp < 1 or (max_depth < 2 and max_depth != -1):
+        raise UserError(f"--views {views} --size {size} --spp {spp} --depth {max_depth}: too small; raise it")
+    if Path(name).name != name:
+        raise UserError(f"--output {name}: give a name without folders; pictures go to {folder / 'renders'}")
+    scene, config = saved_run(folder, changed)
+    stage = finished_appearance(scene, config, folder, max_depth)
+    if stage is None:
+        raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")
+    stage.set_bounces()
+    stage.rendering.limit_bounces(_BRIGHTEST_BOUNCE / stage.exposure)
+    frames = lit_turntable(stage, views, size, spp)
+    paths = [folder / "renders" / f"{name}.png"]
+    write_sheet({scene.prompt: frames}, paths[0])
+    for number, frame in enumerate(frames):
+        paths.append(folder / "renders" / f"{name}_{number:02d}.png")
+        write_picture(paths[-1], Image.fromarray(frame))
+    return paths

@@ -1,0 +1,241 @@
+"""What can be said about a run before anyone waits for it: the base, the regions, the cost, and what to improve."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
+from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.part_material import part_material
+from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid
+from fd_mitsuba.scene.triangle_mesh import Topology, topology
+
+THINNEST_IN_CELLS = 3.0
+"""A region thinner than this many cells of the grid loses its shape in the marching tetrahedra."""
+
+
+@dataclass(frozen=True)
+class BaseCheck:
+    """One mesh of the base: sizes, and `Topology` with positions taken as one where they are equal."""
+
+    name: str
+    vertices: int
+    faces: int
+    volume: float
+    """Enclosed volume in the user's units; negative where the faces point inwards, rough where the mesh is open."""
+    topology: Topology
+
+
+@dataclass(frozen=True)
+class RegionCheck:
+    """One focal region, lengths in the user's units."""
+
+    name: str
+    part: str
+    share_in_grid: float
+    gap_to_base: float
+    share_in_base: float
+    """Share of the region's volume that the base already fills."""
+    volume_cells: float
+    thickness_cells: float
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """Everything `fd_mitsuba check` prints. A scene that cannot be edited at all never gets here: loading it fails."""
+
+    scene: str
+    prompt: str
+    base: tuple[BaseCheck, ...]
+    base_closed: bool
+    base_low: tuple[float, ...]
+    base_high: tuple[float, ...]
+    """Corners of the base's bounding box in the user's units."""
+    longest_side: float
+    """Longest side of the base's bounding box in the user's units."""
+    grid_cell: float
+    """Side of a grid cell in the user's units."""
+    grid_low: tuple[float, ...]
+    grid_high: tuple[float, ...]
+    """Corners of the cube in the user's units within which a part can grow."""
+    regions: tuple[RegionCheck, ...]
+    cost: CostEstimate
+    warnings: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain dicts, lists, numbers and strings for `json.dumps`, keys as the attributes."""
+        return dataclasses.asdict(self)
+
+    def lines(self) -> list[str]:
+        """The report as lines for a person, warnings last."""
+        lines = [f"scene    {self.scene}", f"prompt   {self.prompt}"]
+        for mesh in self.base:
+            found = mesh.topology
+            state = "closed" if found.closed else f"open ({found.boundary_edges} boundary edges)"
+            pieces = f"{found.components} component{'s' if found.components != 1 else ''}"
+            lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
+        lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
+        lines.append(f"         base {_box(self.base_low, self.base_high)}")
+        lines.append(f"         grid {_box(self.grid_low, self.grid_high)}")
+        for region in self.regions:
+            touch = "touches the base" if region.gap_to_base == 0 else f"{region.gap_to_base:.3g} from the base"
+            lines.append(
+                f"region   {region.name} (part {region.part}): {touch}, {region.share_in_grid:.1%} in the grid, "
+                f"{region.share_in_base:.0%} within the base, {region.thickness_cells:.1f} cells thin"
+            )
+        cost = self.cost
+        lines.append(
+            f"cost     shape: about {_number(cost.seconds_per_step)} s a step, {_duration(cost.seconds_total)} in all, "
+            f"{cost.memory_mb / 1000:.1f} GB of memory; {cost.active_share:.1%} of the grid active"
+        )
+        if cost.appearance_seconds_total > 0:
+            step, whole = _number(cost.appearance_seconds_per_step), _duration(cost.appearance_seconds_total)
+            lines.append(f"         material: about {step} s a step, {whole} in all")
+        lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
+        lines += [f"warning  {warning}" for warning in self.warnings] or ["ok       nothing to warn of"]
+        return lines
+
+
+def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
+    """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written."""
+    base = tuple(
+        BaseCheck(mesh.name, len(mesh.vertices), len(mesh.faces), mesh.volume(), topology(mesh.vertices, mesh.faces))
+        for mesh in scene.base
+    )
+    cell = 2 * GRID_HALF_EXTENT / config.geometry.grid_resolution
+    soup = scene.base_canonical
+    distance = MeshDistance(soup.vertices, soup.faces)
+    regions = tuple(_region(scene, region, distance, cell) for region in scene.regions)
+    cost = estimate_cost(scene, config)
+    used = scene.base_soup.vertices[np.unique(scene.base_soup.faces)]
+    return CheckReport(
+        scene=str(scene.path),
+        prompt=scene.prompt,
+        base=base,
+        base_closed=all(mesh.topology.closed for mesh in base),
+        base_low=tuple(used.min(axis=0).tolist()),
+        base_high=tuple(used.max(axis=0).tolist()),
+        longest_side=float(np.ptp(used, axis=0).max()),
+        grid_cell=cell / scene.frame.scale,
+        grid_low=_user_corner(scene, -GRID_HALF_EXTENT),
+        grid_high=_user_corner(scene, GRID_HALF_EXTENT),
+        regions=regions,
+        cost=cost,
+        warnings=tuple(_base_warnings(base) + _region_warnings(regions, config) + _scene_warnings(scene, config)),
+    )
+
+
+def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
+    return ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+
+
+def _user_corner(scene: EditScene, value: float) -> tuple[float, ...]:
+    return tuple(float(x) for x in scene.frame.to_user(np.full(3, value)))
+
+
+def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell: float) -> RegionCheck:
+    low, high = region.bounds
+    points = low + np.random.default_rng(0).random((6000, 3)) * (high - low)
+    points = points[region.sdf(points) > 0]
+    return RegionCheck(
+        name=region.name,
+        part=region.part,
+        share_in_grid=share_in_grid(region),
+        gap_to_base=gap_to_base(region, distance, scene.base_canonical) / scene.frame.scale,
+        share_in_base=float(np.mean(distance.inside(points))) if len(points) else 0.0,
+        volume_cells=region.volume / cell**3,
+        thickness_cells=region.thickness / cell,
+    )
+
+
+def _base_warnings(base: tuple[BaseCheck, ...]) -> list[str]:
+    warnings = []
+    for mesh in base:
+        found, name = mesh.topology, f"base {mesh.name}"
+        if not found.closed and found.boundary_edges:
+            warnings.append(
+                f"{name}: not closed ({found.boundary_edges} boundary edges); its holes count as filled "
+                "where most of the surface around them exists: fill them if the part grows there"
+            )
+        if found.closed and mesh.volume < 0:
+            warnings.append(f"{name}: its faces point inwards; flip them, or it is lit from the wrong side")
+        if found.misoriented_edges:
+            warnings.append(
+                f"{name}: {found.misoriented_edges} edges between faces that point opposite ways; "
+                "make the faces point outwards"
+            )
+        if found.nonmanifold_edges:
+            warnings.append(f"{name}: {found.nonmanifold_edges} edges with more than two faces; harmless for editing")
+        if found.degenerate_faces:
+            warnings.append(f"{name}: {found.degenerate_faces} faces without area; remove them")
+        if found.duplicate_faces:
+            warnings.append(f"{name}: {found.duplicate_faces} faces are there twice; remove the copies")
+        if mesh.faces > 1_000_000:
+            warnings.append(f"{name}: {mesh.faces} faces make every step slower; a tenth of them is enough")
+    return warnings
+
+
+def _region_warnings(regions: tuple[RegionCheck, ...], config: RunConfig) -> list[str]:
+    warnings = []
+    for region in regions:
+        name = f"region {region.name}"
+        if region.share_in_grid < 0.999:  # half a percent is a cap of 8 % of a half-axis, flat for all to see
+            warnings.append(
+                f"{name}: {1 - region.share_in_grid:.1%} of it lies outside the grid and cannot be edited; "
+                "move or shrink it until it fits the grid's extent above"
+            )
+        if region.gap_to_base > 0:
+            warnings.append(
+                f"{name}: a gap of {region.gap_to_base:.3g} to the base; the part may float: "
+                "move it until they overlap a little"
+            )
+        if region.share_in_base > 0.9:
+            warnings.append(
+                f"{name}: {region.share_in_base:.0%} of it is inside the base, where nothing is seen; "
+                "move it outwards or enlarge it"
+            )
+        if region.thickness_cells < THINNEST_IN_CELLS:
+            resolution = config.geometry.grid_resolution
+            needed = int(np.ceil(resolution * THINNEST_IN_CELLS / max(region.thickness_cells, 1e-9)))
+            cure = f"set geometry.grid_resolution={needed} or thicken it" if needed <= 256 else "thicken it"
+            warnings.append(f"{name}: only {region.thickness_cells:.1f} grid cells thin; {cure}")
+    return warnings
+
+
+def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
+    warnings = []
+    if not scene.base_prompt:
+        warnings.append("no base_prompt: preservation scores and before/after prompts lack it; describe the base")
+    elif scene.base_prompt.casefold() == scene.prompt.casefold():
+        warnings.append("prompt and base_prompt are the same; say in the prompt what shall be added")
+    if scene.has_light:
+        try:
+            warnings += check_appearance_inputs(scene)
+            part_material(scene, config.appearance.fixed, config.appearance.normal_map)
+        except UserError as error:
+            warnings.append(f"no material can be learned, only a shape (--stage geometry): {error}")
+    else:
+        warnings.append("no emitter: previews use a lamp of their own; add an envmap for the appearance")
+    if config.geometry.lambda_focal == 0:
+        warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")
+    return warnings
+
+
+def _number(value: float) -> str:
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

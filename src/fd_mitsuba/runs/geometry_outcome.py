@@ -1,0 +1,155 @@
+"""The geometry stage within a run: its guidance, its outcome in another folder, the meshes and pictures it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fd_mitsuba import __version__
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.cut_shapes import CutBase, cut_base
+from fd_mitsuba.export.meshes import copy_base, write_mesh
+from fd_mitsuba.export.part_record import part_file, part_record
+from fd_mitsuba.export.solid.part_solid import part_solid
+from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.json_object import write_json
+from fd_mitsuba.io.ply import ply_bytes
+from fd_mitsuba.runs.locality import measure_locality
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.region_mode import cut_faces_name
+from fd_mitsuba.scene.scene_file import SceneFile
+from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
+from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.viewing.turntable import render_ring, write_sheet, write_video
+
+_SHEET_VIEWS = 8
+
+
+def prepare_geometry(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -> DiffusionGuidance | None:
+    """The guidance of the geometry stage with the scene's prompt; None where it has no weight.
+
+    Raises:
+        UserError: a model that cannot be loaded, a prompt that it does not know, a cut that it cannot guide.
+    """
+    if config.geometry.lambda_sds == 0:
+        return None
+    guidance = DiffusionGuidance.load(config.guidance)
+    if guidance.conventions.vocabulary is not None and scene.subtracts:
+        raise UserError(
+            f"{scene.path}: its regions subtract, and the built-in prior knows only parts that are added; set "
+            "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
+        )
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say)
+    return guidance
+
+
+def refuse_other_shape(before: EditScene, now: EditScene, source: Path) -> None:
+    """UserError if a run's scene has another base or other focal regions; light, materials and prompt may differ."""
+    same_base = all(
+        np.array_equal(getattr(before.base_soup, name), getattr(now.base_soup, name)) for name in ("vertices", "faces")
+    )
+
+    def places(scene: EditScene) -> list[tuple]:
+        return [(region.name, region.part, region.mode, region.to_canonical.tobytes()) for region in scene.regions]
+
+    if not same_base or places(before) != places(now):
+        raise UserError(f"{source}: its base or its focal regions are others than those of {now.path}; run anew")
+
+
+def take_geometry(source: Path, folder: Path) -> None:
+    """Copy the newest geometry checkpoint of another run, which `load_finished_stage` has accepted."""
+    newest = list_checkpoints(checkpoint_folder(source, GeometryStage.name))[-1]
+    write_atomically(checkpoint_folder(folder, GeometryStage.name) / newest.name, newest.read_bytes())
+
+
+def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> GeometryStage:
+    """The geometry stage of a run folder at its newest checkpoint, without guidance; UserError if there is none."""
+    stage = GeometryStage(scene, config, None)
+    if not load_trained(folder, stage, config.content_hash(stage.name)):
+        raise UserError(f"{checkpoint_folder(folder, stage.name)}: no checkpoint; run the geometry stage first")
+    return stage
+
+
+def export_geometry(stage: GeometryStage, folder: Path) -> dict:
+    """Write meshes, turntable and contact sheet of the stage's present state; returns the measured figures."""
+    scene, config, export = stage.scene, stage.config, folder / "export"
+    with torch.no_grad():
+        union = stage.surface()
+    parts = {name: part_solid(stage, name) for name in scene.parts}
+    figures: dict[str, Any] = {}
+    opened = None
+    if scene.subtracts:
+        cut = cut_out(scene, parts)
+        figures = cut.figures
+        for name, data in (cut.files() | cut.files(opened=True)).items():
+            write_atomically(export / name, data)
+        for name, mesh in cut.faces.items():
+            write_atomically(export / f"{cut_faces_name(name)}.ply", ply_bytes(mesh.vertices, mesh.faces))
+        parts, opened = removed_parts(scene, cut), cut.names(opened=True)
+    for name, solid in parts.items():
+        if len(solid.faces):
+            write_mesh(export / part_file(name), solid.vertices, solid.faces, scene)
+    write_json(export / "part.json", part_record(scene, parts, opened))
+    write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
+    identical = copy_base(scene, export / "base")
+    # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
+    grown = tuple(tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
+    base = scene.base_canonical
+    locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
+    whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage, None)
+    _write_turntable(stage, (torch.from_numpy(whole.vertices), torch.from_numpy(whole.faces)), folder)
+    return {
+        "version": __version__,
+        "prompt": scene.prompt,
+        "seed": config.seed,
+        "steps": config.geometry.steps,
+        "guidance_model": config.guidance.model,
+        **asdict(locality),
+        "base_identical": identical,
+        "part_faces": {name: len(solid.faces) for name, solid in parts.items()},
+        "manifold": all(solid.manifold for solid in parts.values()),
+        "islands_removed": whole.islands_removed,
+        "bridged": whole.bridged,
+        "gap": whole.gap(base),
+        "assembled_faces": len(union.faces),
+        **figures,
+    }
+
+
+def cut_out(scene: EditScene, solids: dict[str, Solid]) -> CutBase:
+    """What the parts of a scene that subtracts take away, and what they leave of the base."""
+    return cut_base(scene, SceneFile(scene.path, scene.parameters), solids)
+
+
+def removed_parts(scene: EditScene, cut: CutBase) -> dict[str, Solid]:
+    """What each part took away, in the canonical frame."""
+    return {name: solid.moved(scene.frame.matrix()) for name, solid in cut.removed.items()}
+
+
+def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tensor], folder: Path) -> None:
+    output, aim = stage.config.output, stage.aim
+    with torch.no_grad():
+        union = stage.surface()
+    start = stage.start_surface()
+    edited = (union.vertices, union.faces)
+    base = (stage.base_surface.vertices, stage.base_surface.faces)
+    for name, mesh in {"turntable": edited, "turntable_base": base, "turntable_part": part}.items():
+        frames = render_ring(mesh, output.turntable_frames, output.turntable_size, aim)
+        write_video(frames, folder / "videos" / f"{name}.mp4")
+    size = min(output.turntable_size, 192)
+    rows = {
+        "base": render_ring(base, _SHEET_VIEWS, size, aim),
+        "base with the focal regions": render_ring((start.vertices, start.faces), _SHEET_VIEWS, size, aim),
+        f"result: {stage.scene.prompt}": render_ring(edited, _SHEET_VIEWS, size, aim),
+        "part": render_ring(part, _SHEET_VIEWS, size, aim),
+    }
+    write_sheet(rows, folder / "images" / "turntable.png")

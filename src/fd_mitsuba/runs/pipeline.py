@@ -1,0 +1,176 @@
+"""Scene and settings in, run folder out: what `fd_mitsuba run` does, as a Python API."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from fd_mitsuba.backend.peak_memory import peak_memory_mb
+from fd_mitsuba.backend.threads import rendering_threads
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.assets import PartAsset, export_assets
+from fd_mitsuba.export.part_record import part_record
+from fd_mitsuba.export.solid.part_solid import part_solid
+from fd_mitsuba.export.solid.solid import LEAST_FACES
+from fd_mitsuba.fields.texture import TextureField
+from fd_mitsuba.io.json_object import write_json
+from fd_mitsuba.runs.appearance_outcome import (
+    CUTS_UNKNOWN,
+    finished_appearance,
+    opened_base,
+    parts_of_run,
+    prepare_appearance,
+    write_appearance,
+)
+from fd_mitsuba.runs.geometry_outcome import (
+    cut_out,
+    export_geometry,
+    load_finished_stage,
+    prepare_geometry,
+    refuse_other_shape,
+    removed_parts,
+    take_geometry,
+)
+from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint
+from fd_mitsuba.runs.saved_run import saved_run
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.training.appearance_stage import AppearanceStage
+from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.loop import run_stage
+
+STAGES = ("geometry", "appearance")
+
+
+def run(
+    scene: EditScene,
+    config: RunConfig,
+    folder: Path,
+    resume: bool = False,
+    command: str = "",
+    quiet: bool = False,
+    say: Callable[[str], None] = print,
+    stages: Collection[str] = STAGES,
+    geometry_from: Path | None = None,
+) -> dict:
+    """Grow the part, give it its material, and write the run folder; returns what `metrics.json` holds.
+
+    Args:
+        folder: made if it is missing; must be empty, or hold a run of the same scene and settings to go on with.
+        resume: go on with the run in `folder`.
+        command: the command line, for the record.
+        say: takes remarks for the user, a line each.
+        stages: which of `STAGES` to run. The appearance stage alone needs a folder whose geometry stage is finished.
+        geometry_from: another run folder, whose finished geometry is taken over instead of running that stage.
+
+    Raises:
+        UserError, RunStopped, Interrupted: see `training.loop.run_stage`. A run that ends with an error before its
+            first checkpoint leaves no folder behind.
+    """
+    started = time.monotonic()
+    asked, with_assets = stages, "appearance" in stages
+    if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
+        if "geometry" not in stages:
+            raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
+        say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
+        stages = ("geometry",)
+    with_geometry = "geometry" in stages and geometry_from is None
+    check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
+    # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
+    guidance = prepare_geometry(scene, config, say) if with_geometry else None
+    # Both priors know the same words: what the geometry stage has said of them is not said again.
+    listener = (lambda line: None) if guidance is not None else say
+    for_appearance = prepare_appearance(scene, config, say, listener, guidance) if "appearance" in stages else None
+    if with_geometry:
+        geometry = GeometryStage(scene, config, guidance)
+        with discarded_without_checkpoint(folder):
+            describe_run(scene, config, folder, command)
+            run_stage(geometry, folder, resume, quiet, say)
+    elif geometry_from is not None:
+        refuse_other_shape(saved_run(geometry_from)[0], scene, geometry_from)
+        geometry = load_finished_stage(scene, config, geometry_from)
+        describe_run(scene, config, folder, command)
+        take_geometry(geometry_from, folder)
+    else:
+        geometry = load_finished_stage(scene, config, folder)
+    with rendering_threads():
+        metrics = export_geometry(geometry, folder)
+
+    def write_metrics() -> None:
+        metrics["seconds"] = round(time.monotonic() - started, 1)
+        metrics["peak_memory_mb"] = peak_memory_mb()
+        write_json(folder / "metrics.json", metrics)
+
+    write_metrics()
+    field = None
+    if "appearance" in stages:
+        appearance = AppearanceStage(
+            scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
+        )
+        run_stage(appearance, folder, resume, quiet, say)
+        with rendering_threads():
+            field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
+        write_metrics()
+    if with_assets:
+        with rendering_threads():
+            write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+    # Written last of all: a folder without it is not finished.
+    done = {"geometry", *stages}
+    metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}
+    write_metrics()
+    return metrics
+
+
+def export_run(
+    folder: Path,
+    formats: Collection[str],
+    texture_size: int,
+    say: Callable[[str], None] = print,
+    faces: int | None = None,
+) -> dict[str, Any]:
+    """Write the assets of a run, finished or interrupted, as of its newest checkpoint; see `export.assets`.
+
+    Args:
+        faces: at most so many triangles a part; None: all.
+
+    Raises:
+        UserError: no run or no checkpoint there, and see `export.assets.export_assets`.
+    """
+    if faces is not None and faces < LEAST_FACES:
+        raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
+    scene, config = saved_run(folder)
+    geometry = load_finished_stage(scene, config, folder)
+    appearance = finished_appearance(scene, config, folder)
+    field = None if appearance is None else appearance.field
+    return write_assets(geometry, field, folder, formats, texture_size, say, faces)
+
+
+def write_assets(
+    geometry: GeometryStage,
+    field: TextureField | None,
+    folder: Path,
+    formats: Collection[str],
+    texture_size: int,
+    say: Callable[[str], None],
+    faces: int | None = None,
+) -> dict[str, Any]:
+    """Write the assets of the stages' present state below `folder`; returns what `export.assets` says of them.
+
+    Args:
+        field: the parts' learned material; None: the constants of the scene's part BSDF.
+        faces: at most so many triangles a part; None: all.
+    """
+    scene = geometry.scene
+    solids = {name: part_solid(geometry, name) for name in scene.parts}
+    if faces is not None:
+        solids = {name: solid.decimated(faces) for name, solid in solids.items()}
+    cut = cut_out(scene, solids) if scene.subtracts else None
+    if cut is not None:
+        solids = removed_parts(scene, cut)
+    parts = {name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field) for name, solid in solids.items()}
+    opened = None if cut is None else cut.names(opened=True)
+    write_json(folder / "export" / "part.json", part_record(scene, solids, opened))
+    export = folder / "export"
+    return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
