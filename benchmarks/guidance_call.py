@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from machine import print_figures  # noqa: E402
 
-from fd_mitsuba.config import load_config  # noqa: E402
+from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance  # noqa: E402
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews, Phase  # noqa: E402
 
@@ -38,7 +38,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
-    config = load_config(ROOT / "configs" / "quick.toml")
+    config = RunConfig.load(ROOT / "configs" / "quick.toml")
     shapes = DiffusionGuidance.load(config.guidance)
     colours = shapes.for_appearance(config.appearance)
     for guidance in (shapes, colours):

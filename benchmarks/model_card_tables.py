@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-CARD = ROOT / "src" / "fd_mitsuba" / "prior" / "MODEL_CARD.md"
+CARD = ROOT / "src" / "fd_mitsuba" / "weights" / "MODEL_CARD.md"
 
 _SAMPLE_COLUMNS = (
     *("recall", "recall_in_truth", "body_named", "body_named_in_truth"),

@@ -2,10 +2,52 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fd_mitsuba.api import Run, edit, evaluate, load_scene
+    from fd_mitsuba.config import RunConfig as Config
+    from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 
 __version__ = "0.1.0"
+__all__ = [
+    "Config",
+    "Interrupted",
+    "Run",
+    "RunStopped",
+    "UserError",
+    "__version__",
+    "edit",
+    "evaluate",
+    "load_scene",
+    "register",
+]
+_PLACES = {
+    "Config": ("fd_mitsuba.config", "RunConfig"),
+    "Interrupted": ("fd_mitsuba.errors", "Interrupted"),
+    "Run": ("fd_mitsuba.runs.run", "Run"),
+    "RunStopped": ("fd_mitsuba.errors", "RunStopped"),
+    "UserError": ("fd_mitsuba.errors", "UserError"),
+    "edit": ("fd_mitsuba.api", "edit"),
+    "evaluate": ("fd_mitsuba.api", "evaluate"),
+    "load_scene": ("fd_mitsuba.api", "load_scene"),
+}
+"""Where the public names live. They are imported when they are first used, so that the package imports in no time."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _PLACES[name]
+    value = getattr(importlib.import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def register() -> Any:

@@ -11,7 +11,7 @@ import pytest
 from conftest import BASE, LIGHT
 from PIL import Image
 
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import load_edit_scene
@@ -168,7 +168,7 @@ def test_truncated_texture(make_scene: Make, tmp_path: Path) -> None:
 )  # fmt: skip
 def test_absurd_settings(override: str, words: str) -> None:
     with pytest.raises(UserError) as caught:
-        load_config(None, [override])
+        RunConfig.load(None, [override])
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 

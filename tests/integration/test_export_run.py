@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.runs.run_folder import describe_run
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, list_checkpoints, save_checkpoint
@@ -22,7 +22,7 @@ Make = Callable[..., Path]
 def run_folder(make_scene: Make, tmp_path: Path) -> Path:
     """A run that was interrupted after its first checkpoint; the part is still the region."""
     scene = load_edit_scene(make_scene())
-    config = load_config(None, ["geometry.grid_resolution=16", "geometry.lambda_sds=0"])
+    config = RunConfig.load(None, ["geometry.grid_resolution=16", "geometry.lambda_sds=0"])
     folder = tmp_path / "run"
     describe_run(scene, config, folder, "fd_mitsuba run scene.xml")
     stage = GeometryStage(scene, config, None)

@@ -15,8 +15,9 @@ from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.edit_scene import load_edit_scene
-from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage, StepRecord
+from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage
 from fd_mitsuba.training.loop import run_stage
+from fd_mitsuba.training.stage import StepRecord
 
 
 class PullMask:

@@ -25,7 +25,7 @@ from PIL import Image
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.io.atomic import is_litter
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage
@@ -177,7 +177,7 @@ def test_metrics_of_the_run(finished: Path) -> None:
 
 def test_overlap_is_that_of_the_part_as_it_grew(finished: Path, place: Path) -> None:
     """The exported solid reaches into the base on purpose, so it overlaps more."""
-    config = load_config(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
+    config = RunConfig.load(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
     scene = load_edit_scene(place / "scene.xml")
     stage = load_finished_stage(scene, config, finished)
     vertices, faces = (tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
@@ -207,9 +207,8 @@ def test_rows_of_both_phases(finished: Path) -> None:
 
 def test_record_of_what_was_run(finished: Path, place: Path) -> None:
     assert (finished / "command.txt").read_text().startswith("fd_mitsuba run ")
-    assert load_config(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"]).model_dump(mode="json") == json.loads(
-        (finished / "config.json").read_text()
-    )
+    config = RunConfig.load(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
+    assert config.model_dump(mode="json") == json.loads((finished / "config.json").read_text())
     environment = json.loads((finished / "environment.json").read_text())
     assert environment["mitsuba"].startswith("3.9") and environment["threads"] == 1
     assert (finished / "scene" / "scene.xml").read_bytes() == (place / "scene.xml").read_bytes()
@@ -219,7 +218,7 @@ def test_record_of_what_was_run(finished: Path, place: Path) -> None:
 
 def test_finished_stage_can_be_loaded(finished: Path, place: Path) -> None:
     scene = load_edit_scene(place / "scene.xml")
-    config = load_config(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
+    config = RunConfig.load(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
     stage = load_finished_stage(scene, config, finished)
     metrics = json.loads((finished / "metrics.json").read_text())
     assert len(part_solid(stage, "part").faces) == metrics["part_faces"]["part"]

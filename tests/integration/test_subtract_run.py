@@ -15,7 +15,7 @@ from conftest import write_ply
 from PIL import Image
 
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.appearance_outcome import render_run
 from fd_mitsuba.runs.pipeline import export_run, run
@@ -84,7 +84,7 @@ def read(mi: Any, path: Path) -> tuple[np.ndarray, np.ndarray]:
 def run_of(scene: Path, folder: Path) -> dict:
     return run(
         load_edit_scene(scene),
-        load_config(None, SETTINGS),
+        RunConfig.load(None, SETTINGS),
         folder,
         quiet=True,
         say=lambda line: None,
@@ -168,7 +168,7 @@ def test_the_built_in_prior_leaves_the_appearance_stage_out_with_a_remark(
     make_scene: Make, ball: str, tmp_path: Path
 ) -> None:
     scene, said = load_edit_scene(make_scene(base=ball, region=region())), []
-    config = load_config(None, [*SETTINGS, "geometry.grid_resolution=20"])
+    config = RunConfig.load(None, [*SETTINGS, "geometry.grid_resolution=20"])
     metrics = run(scene, config, tmp_path / "run", quiet=True, say=said.append)
     assert "appearance" not in metrics and any("only the geometry stage" in line for line in said)
     assert (tmp_path / "run" / "export" / "asset.glb").is_file()
@@ -196,7 +196,7 @@ def test_the_faces_of_a_cut_learn_a_material(make_scene: Make, ball: str, tmp_pa
     """Without guidance the style losses alone teach it, here on all of it: it takes the ball's paint."""
     part = '<bsdf type="principled" id="part"><rgb name="base_color" value="0.1, 0.2, 0.6"/></bsdf>'
     scene, folder = load_edit_scene(make_scene(base=ball, region=region(), part=part)), tmp_path / "run"
-    config = load_config(None, [*SETTINGS, *PAINTED])
+    config = RunConfig.load(None, [*SETTINGS, *PAINTED])
     metrics = run(scene, config, folder, quiet=True, say=lambda line: None)
     found = metrics["appearance"]
     assert found["base_psnr_db"] > 60 and found["mask_error"] < 1e-6 and 0 < found["untouched_share"] < 1

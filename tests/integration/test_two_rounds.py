@@ -15,7 +15,7 @@ import torch
 from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.runs.run_folder import describe_run
@@ -73,7 +73,7 @@ def again(first: Path, folder: Path, **options: str) -> EditScene:
 def second(first: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a second round; its part is still the region."""
     root = tmp_path_factory.mktemp("second")
-    scene, config, folder = again(first, root), load_config(None, SMALL), root / "run"
+    scene, config, folder = again(first, root), RunConfig.load(None, SMALL), root / "run"
     describe_run(scene, config, folder, "fd_mitsuba run")
     stage = GeometryStage(scene, config, None)
     header = CheckpointHeader(stage.name, 2, config.content_hash(stage.name), counters=dict(stage.counters))

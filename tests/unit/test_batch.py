@@ -18,7 +18,7 @@ import pytest
 from fd_mitsuba.batch.local import Job, Outcome, is_finished, job_matrix, run_batch
 from fd_mitsuba.batch.record import read_record
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 
 STUB = """
@@ -95,7 +95,7 @@ def test_matrix(place: Place) -> None:
     names = [job.name for job in place.jobs()]
     assert names == ["cat-quick-0", "cat-quick-1", "mug-quick-0", "mug-quick-1"]
     (job,) = job_matrix([place.root / "cat"], [place.root / "quick.toml"], None, ("geometry.views=2",), place.out)
-    assert job.name == "cat-quick-5" and job.settings() == load_config(job.config, ["geometry.views=2"])
+    assert job.name == "cat-quick-5" and job.settings() == RunConfig.load(job.config, ["geometry.views=2"])
     (default,) = job_matrix([place.root / "cat"], [], [3], (), place.out)
     assert default.name == "cat-default-3" and "-c" not in default.words(1)
 

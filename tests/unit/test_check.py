@@ -9,7 +9,7 @@ import pytest
 from conftest import BASE, write_ply
 from PIL import Image
 
-from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig, load_config
+from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import working_set_bytes
 from fd_mitsuba.runs.check import check_scene
@@ -31,7 +31,7 @@ def warnings(path: Path, config: RunConfig | None = None) -> str:
 
 
 def test_a_good_scene_has_no_warnings(make_scene: Make) -> None:
-    report = check_scene(load_edit_scene(make_scene(region=ball("0.15", 0, 0.3, 0))), RunConfig())
+    report = check_scene(load_edit_scene(make_scene(region=ball("0.15", 0, 0.3, 0))), RunConfig.load("quick"))
     assert report.warnings == () and report.base_closed
     (base,), (region,) = report.base, report.regions
     assert base.topology.closed and base.topology.components == 1 and base.volume > 0
@@ -140,22 +140,22 @@ def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
 )
 def test_cost_of_runs_that_were_measured(more: list[str], seconds: float, megabytes: float) -> None:
     scene = load_edit_scene(ROOT / "scenes" / "pegasus" / "scene.xml")
-    cost = estimate_cost(scene, load_config(ROOT / "configs" / "quick.toml", more))
+    cost = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", more))
     assert cost.seconds_per_step == pytest.approx(seconds, rel=0.3)
     assert cost.memory_mb == pytest.approx(megabytes, rel=0.2)
 
 
 def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
     scene = load_edit_scene(make_scene())
-    quick = estimate_cost(scene, load_config(ROOT / "configs" / "quick.toml", []))
+    quick = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", []))
     assert quick.appearance_seconds_per_step == pytest.approx(0.4, rel=0.4)  # 0.52 s, with other work on the cores
     # `benchmarks/appearance_step.py`: 4 views of 128 x 128 pixels, 16 samples, no network.
-    plain = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.picture_size=128"]))
+    plain = estimate_cost(scene, RunConfig.load(None, ["appearance.lambda_sds=0", "appearance.picture_size=128"]))
     assert plain.appearance_seconds_per_step == pytest.approx(0.5, rel=0.2)
-    short = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.steps=200"]))
+    short = estimate_cost(scene, RunConfig.load(None, ["appearance.lambda_sds=0", "appearance.steps=200"]))
     steps = [cost.appearance_seconds_total - LIT_PICTURES_SECONDS for cost in (short, plain)]
     assert steps[0] == pytest.approx(steps[1] / 10)
-    deep = estimate_cost(scene, load_config(None, ["appearance.lambda_sds=0", "appearance.max_depth=6"]))
+    deep = estimate_cost(scene, RunConfig.load(None, ["appearance.lambda_sds=0", "appearance.max_depth=6"]))
     assert deep.appearance_seconds_per_step > 2 * plain.appearance_seconds_per_step
     lines = check_scene(scene, RunConfig()).lines()
     assert sum("s a step" in line for line in lines) == 2
@@ -165,7 +165,7 @@ def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
 
 
 def test_memory_of_stable_diffusion_is_what_loading_it_demands(make_scene: Make) -> None:
-    config = load_config(ROOT / "configs" / "paper.toml")
+    config = RunConfig.load(ROOT / "configs" / "paper.toml")
     cost = estimate_cost(load_edit_scene(make_scene()), config)
     unet = {"block_out_channels": [320, 640, 1280, 1280]}
     vae = {"block_out_channels": [128, 256, 512, 512], "layers_per_block": 2}

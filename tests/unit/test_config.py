@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,14 +17,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def refusal(path: Path | None = None, *overrides: str) -> str:
     with pytest.raises(UserError) as caught:
-        load_config(path, overrides)
+        RunConfig.load(path, overrides)
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
 def test_defaults_are_the_papers() -> None:
-    config = load_config(None)
+    config = RunConfig.load(None)
     assert config == RunConfig()
     geometry = config.geometry
     assert (geometry.steps, geometry.learning_rate, geometry.union_k, geometry.views) == (3000, 1e-3, 0.15, 4)
@@ -36,13 +36,13 @@ def test_defaults_are_the_papers() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "quick", "smoke"])
 def test_shipped_files_are_valid(name: str) -> None:
-    load_config(ROOT / "configs" / f"{name}.toml")
+    RunConfig.load(ROOT / "configs" / f"{name}.toml")
 
 
 def test_file_and_overrides(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text("seed = 3\n[geometry]\nsteps = 7\nviews = 2\n")
-    config = load_config(path, ["geometry.steps=9", "cameras.fov_deg=[40, 41]", "guidance.model=a/b", "seed=5"])
+    config = RunConfig.load(path, ["geometry.steps=9", "cameras.fov_deg=[40, 41]", "guidance.model=a/b", "seed=5"])
     assert (config.geometry.steps, config.geometry.views, config.seed) == (9, 2, 5)
     assert config.cameras.fov_deg == (40.0, 41.0) and config.guidance.model == "a/b"
 
@@ -52,7 +52,7 @@ def test_file_and_overrides(tmp_path: Path) -> None:
     [("sd 2=1/x", "sd 2=1/x"), ('"1"', "1"), ("true story", "true story"), ("", "")],
 )
 def test_text_that_is_not_toml_stays_text(text: str, value: str) -> None:
-    assert load_config(None, [f"guidance.model={text}"]).guidance.model == value
+    assert RunConfig.load(None, [f"guidance.model={text}"]).guidance.model == value
 
 
 def test_missing_file() -> None:
@@ -114,7 +114,7 @@ def test_bad_value_of_the_file_is_not_blamed_on_an_override(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("override", ["geometry.steps = 200", " geometry . steps=200 ", "geometry.steps= 200"])
 def test_blanks_in_an_override(override: str) -> None:
-    assert load_config(None, [override]).geometry.steps == 200
+    assert RunConfig.load(None, [override]).geometry.steps == 200
 
 
 def test_unknown_section_names_sections() -> None:
@@ -180,9 +180,9 @@ LATER = ["reconstruction_steps=9", "ism_interval=0.1", "ism_inversion_step=0.1",
 
 def test_later_settings_count_only_when_they_are_changed() -> None:
     """So that runs from before can still be read; the device never counts."""
-    hashes = [load_config(None, [f"guidance.{override}"]).content_hash() for override in LATER]
+    hashes = [RunConfig.load(None, [f"guidance.{override}"]).content_hash() for override in LATER]
     assert len({RunConfig().content_hash(), *hashes}) == len(LATER) + 1
-    assert load_config(None, ["guidance.device=cuda:1"]).content_hash() == RunConfig().content_hash()
+    assert RunConfig.load(None, ["guidance.device=cuda:1"]).content_hash() == RunConfig().content_hash()
 
 
 @pytest.mark.parametrize(
@@ -203,9 +203,9 @@ def test_bad_guidance_is_one_line(override: str, expected: str) -> None:
 
 def test_hash_follows_every_setting() -> None:
     overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "output.sheet_every=3", "cameras.aim=object"]
-    hashes = [load_config(None, [override]).content_hash() for override in overrides]
+    hashes = [RunConfig.load(None, [override]).content_hash() for override in overrides]
     assert len({RunConfig().content_hash(), *hashes}) == len(overrides) + 1
-    assert load_config(None, ["geometry.steps=3000"]).content_hash() == RunConfig().content_hash()
+    assert RunConfig.load(None, ["geometry.steps=3000"]).content_hash() == RunConfig().content_hash()
     assert RunConfig.model_validate(RunConfig().model_dump(mode="json")).content_hash() == RunConfig().content_hash()
 
 
@@ -216,4 +216,4 @@ def test_runs_from_before_a_setting_was_there_can_be_read() -> None:
     known = hashlib.sha256(json.dumps(before, sort_keys=True).encode()).hexdigest()[:16]
     read = RunConfig.model_validate(before)
     assert read.geometry.lambda_tether == 0 and read.content_hash() == RunConfig().content_hash() == known
-    assert load_config(None, ["geometry.lambda_tether=1"]).content_hash() != known
+    assert RunConfig.load(None, ["geometry.lambda_tether=1"]).content_hash() != known

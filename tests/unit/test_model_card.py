@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-CARD = ROOT / "src" / "fd_mitsuba" / "prior" / "MODEL_CARD.md"
+CARD = ROOT / "src" / "fd_mitsuba" / "weights" / "MODEL_CARD.md"
 
 
 def test_tables_are_filled_from_the_files_that_are_there(tmp_path: Path) -> None:

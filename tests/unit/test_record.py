@@ -11,9 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from fd_mitsuba.training.geometry_stage import StepRecord
 from fd_mitsuba.training.record import Recorder, read_metrics
-from fd_mitsuba.viewing.sheets import normal_pictures
+from fd_mitsuba.viewing.sheets import geometry_sheet, normal_pictures
 from fd_mitsuba.viewing.turntable import write_sheet, write_video
 
 
@@ -94,9 +93,10 @@ def test_colours_of_normals() -> None:
 
 @pytest.mark.parametrize("preview", [None, torch.zeros(2, 4, 8, 8)])
 def test_contact_sheet(tmp_path: Path, preview: torch.Tensor | None) -> None:
-    record = StepRecord({}, torch.zeros(2, 5, 16, 16), preview)
+    sheet = geometry_sheet(torch.zeros(2, 5, 16, 16), preview)
+    assert sheet is not None
     with Recorder(tmp_path, "geometry", 10, quiet=True) as recorder:
-        path = recorder.sheet(3, record.sheet())
+        path = recorder.sheet(3, sheet)
     with Image.open(path) as picture:
         width, height = picture.size
     assert path == tmp_path / "images" / "step_000003.png"

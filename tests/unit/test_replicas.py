@@ -29,7 +29,9 @@ def test_gradient_is_that_of_the_mean_over_the_batch(count: int) -> None:
         errors = share(modules, slice(0, SIZE))[1]
         modules.zero_grad(set_to_none=True)
         found = replicas.backward(share, SIZE)
-        assert len(found) == count and torch.equal(torch.cat(found), errors)
+        assert len(found) == count
+        # Products of matrices of other heights may be rounded otherwise, as the processor's BLAS likes.
+        torch.testing.assert_close(torch.cat(found), errors, rtol=1e-12, atol=1e-14)
         for parameter, gradient in zip(modules.parameters(), expected, strict=True):
             assert (parameter.grad is None) == (gradient is None)
             if gradient is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
@@ -53,7 +53,7 @@ def test_needs_resume(scene: EditScene, tmp_path: Path) -> None:
 
 def test_every_changed_setting_is_named(scene: EditScene, tmp_path: Path) -> None:
     describe_run(scene, CONFIG, tmp_path / "out", "command")
-    other = load_config(None, ["geometry.steps=5", "seed=2"])
+    other = RunConfig.load(None, ["geometry.steps=5", "seed=2"])
     with pytest.raises(UserError, match=r"seed = 0, now 2; geometry.steps = 3000, now 5"):
         check_folder(scene, other, tmp_path / "out", resume=True)
 

@@ -43,7 +43,7 @@ def test_the_renderer_shares_only_where_there_are_cores_to_spare() -> None:
 def test_a_process_starts_with_the_shares(given: int, network: int, renderer: int) -> None:
     script = f"""
 import sys
-from fd_mitsuba.threads import network_threads, share_cores
+from fd_mitsuba.backend.threads import network_threads, share_cores
 assert "torch" not in sys.modules
 share_cores({given})
 import os, drjit, torch

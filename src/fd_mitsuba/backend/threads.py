@@ -52,6 +52,12 @@ def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
     _keep_freed_memory()
 
 
+def share_cores_once() -> None:
+    """`share_cores` with all cores, unless it was called before."""
+    if _cores is None:
+        share_cores()
+
+
 def available_cores() -> int:
     """Cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

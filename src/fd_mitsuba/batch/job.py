@@ -12,7 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from fd_mitsuba.config import RunConfig, load_config
+from fd_mitsuba.config import RunConfig, settings_for_run
+from fd_mitsuba.config.toml_reading import locate_settings
 from fd_mitsuba.io.json_object import read_json_object
 
 PROGRAM = (sys.executable, "-m", "fd_mitsuba")
@@ -27,7 +28,7 @@ class Job:
 
     scene: Path
     config: Path | None
-    """None: the default settings."""
+    """As for `-c`; None: what suits the guidance model."""
     seed: int
     overrides: tuple[str, ...]
     """`section.key=value`, as for `--set`."""
@@ -53,13 +54,13 @@ class Job:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     def settings(self) -> RunConfig:
-        """The settings with overrides and seed; UserError as `load_config`."""
-        return load_config(self.config, [*self.overrides, f"seed={self.seed}"])
+        """The settings with overrides and seed; UserError as `settings_for_run`."""
+        return settings_for_run(self.config, [*self.overrides, f"seed={self.seed}"]).config
 
     def words(self, threads: int) -> list[str]:
         """Arguments for the command line; goes on with a run that is there."""
         words = ["run", str(self.scene.resolve())]
-        words += [] if self.config is None else ["-c", str(self.config.resolve())]
+        words += [] if self.config is None else ["-c", str(locate_settings(self.config).resolve())]
         for item in (*self.overrides, f"seed={self.seed}"):
             words += ["--set", item]
         for item in self.definitions:

@@ -20,7 +20,7 @@ from types import FrameType
 from fd_mitsuba.backend.threads import available_cores
 from fd_mitsuba.batch.job import FAILED, INTERRUPTED, KILLED, PROGRAM, Job, Outcome, is_finished, perform
 from fd_mitsuba.batch.record import write_record
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import settings_for_run
 from fd_mitsuba.errors import UserError
 
 __all__ = ["Job", "Outcome", "is_finished", "job_matrix", "run_batch", "scene_name"]
@@ -176,7 +176,7 @@ def _stop_requests() -> Iterator[Callable[[], int]]:
 
 
 def _own_seed(job: Job) -> int:
-    return load_config(job.config, job.overrides).seed
+    return settings_for_run(job.config, job.overrides).config.seed
 
 
 def _spoken(outcome: Outcome) -> str:

@@ -27,7 +27,7 @@ def judge_options(parser: argparse.ArgumentParser) -> None:
 
 def batch_options(parser: argparse.ArgumentParser, folder: str, default: str | None, seeds: list[int]) -> None:
     """What to run first; `folder` is what the help says of the default."""
-    parser.add_argument("-c", "--config", default="configs/quick.toml", metavar="FILE", help="default: %(default)s")
+    parser.add_argument("-c", "--config", default="quick", metavar="FILE|NAME", help="default: %(default)s")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--seeds", nargs="+", type=int, default=seeds, metavar="N", help="default: %(default)s")
     parser.add_argument("-o", "--output", default=default, metavar="FOLDER", help=f"of these runs; default: {folder}")
@@ -146,11 +146,11 @@ def _as_given(options: argparse.Namespace) -> list[str]:
 
 def _readable_scenes(options: argparse.Namespace, shipped: list[ScenePrompts]) -> list[Path]:
     """The shipped scenes that the settings' guidance model can read; a remark says why the others are left out."""
-    from fd_mitsuba.config import load_config
+    from fd_mitsuba.config import RunConfig
     from fd_mitsuba.evaluation.run_evaluation import vocabulary_of
     from fd_mitsuba.guidance.vocabulary import read_prompt
 
-    model = load_config(Path(options.config), options.overrides).guidance.model
+    model = RunConfig.load(Path(options.config), options.overrides).guidance.model
     vocabulary = vocabulary_of(model)
     chosen = []
     for found in shipped:

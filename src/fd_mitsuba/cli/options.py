@@ -38,12 +38,17 @@ def definitions(options: argparse.Namespace) -> dict[str, str]:
 
 def start(options: argparse.Namespace) -> None:
     """Start Mitsuba as the options say."""
+    quiet_libraries(options)
+    from fd_mitsuba.backend.threads import share_cores
+
+    share_cores(options.threads, options.variant)
+
+
+def quiet_libraries(options: argparse.Namespace) -> None:
+    """Without -v, other libraries keep their warnings to themselves; UserError for a number of threads below 0."""
     if options.threads < 0:
         raise UserError(f"-t {options.threads}: give 0 (all cores) or a positive number")
     if not options.verbose:
         warnings.filterwarnings("ignore")
         os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
         os.environ.setdefault("DIFFUSERS_VERBOSITY", "error")
-    from fd_mitsuba.backend.threads import share_cores
-
-    share_cores(options.threads, options.variant)

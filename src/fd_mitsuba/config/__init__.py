@@ -1,6 +1,6 @@
-"""How to edit: frozen, strict settings (`RunConfig`), read by `load_config` and dumped beside every run."""
+"""How to edit: frozen, strict settings (`RunConfig`) from TOML, by the guidance model, kept beside each run."""
 
-from fd_mitsuba.config.loading import load_config
+from fd_mitsuba.config.for_model import ChosenSettings, misfits, settings_for_run
 from fd_mitsuba.config.run_config import RunConfig
 from fd_mitsuba.config.sections import (
     AppearanceConfig,
@@ -16,6 +16,7 @@ from fd_mitsuba.config.sections import (
 __all__ = [
     "AppearanceConfig",
     "CamerasConfig",
+    "ChosenSettings",
     "FieldConfig",
     "GeometryConfig",
     "GuidanceConfig",
@@ -23,5 +24,6 @@ __all__ = [
     "RunConfig",
     "Section",
     "TextureConfig",
-    "load_config",
+    "misfits",
+    "settings_for_run",
 ]

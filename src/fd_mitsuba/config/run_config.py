@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from fd_mitsuba.config.sections import (
     AppearanceConfig,
@@ -18,6 +21,8 @@ from fd_mitsuba.config.sections import (
     Section,
     TextureConfig,
 )
+from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml
+from fd_mitsuba.errors import UserError
 
 _WITHOUT_EFFECT = {"guidance": ("device",)}
 """Settings that change where the work is done and not what comes out."""
@@ -50,6 +55,33 @@ class RunConfig(Section):
             if not (low <= first <= high and low <= last <= high and first <= last) or (name == "betas" and last >= 1):
                 raise ValueError(f"{section}.{name} = ({first}, {last}) must be ordered and lie in [{low}, {high}]")
         return self
+
+    @classmethod
+    def load(cls, source: Path | str | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()) -> RunConfig:
+        """Settings after `section.key=value` overrides, whose values are TOML, or text where they are not TOML.
+
+        Args:
+            source: a TOML file, the name of shipped settings (`quick`, `paper`, `smoke`), a dict of the same form, or
+                None for the defaults, which are the paper's. `settings_for_run` chooses by the guidance model.
+
+        Raises:
+            UserError: unreadable file, unknown section or key, value of the wrong type or out of range.
+
+        Example:
+            RunConfig.load("quick", ["geometry.steps=200", "seed=3"])
+        """
+        if source is None or isinstance(source, Mapping):
+            data: dict[str, Any] = copy.deepcopy(dict(source or {}))
+        else:
+            data = read_toml(source)
+        items = {apply_override(data, item): item for item in overrides}
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            item = guilty_override(error, items)
+            named = "--set" if source is None else "settings" if isinstance(source, Mapping) else source
+            place = f"--set {item}" if item is not None else named
+            raise UserError(f"{place}: {first_problem(error, cls)}") from None
 
     def content_hash(self, stage: str = "geometry") -> str:
         """Sixteen hex digits that change with any setting that the stage depends on, its own and those before it."""

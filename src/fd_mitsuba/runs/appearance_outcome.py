@@ -15,10 +15,12 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.interface import AppearanceGuidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.io.picture import write_picture
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.runs.geometry_outcome import with_prompt
 from fd_mitsuba.runs.preservation import measure_preservation
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
@@ -98,12 +100,14 @@ def prepare_appearance(
     say: Callable[[str], None],
     say_of_prompt: Callable[[str], None],
     shared: DiffusionGuidance | None = None,
-) -> DiffusionGuidance | None:
+    given: AppearanceGuidance | None = None,
+) -> AppearanceGuidance | None:
     """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
 
     Args:
         say: takes remarks about the scene, `say_of_prompt` those about the prompt's words.
         shared: the geometry stage's guidance, so that a large model is loaded once.
+        given: a caller's own guidance, in place of the one that `guidance.model` names.
 
     Raises:
         UserError: see `check_appearance_inputs`, `part_material`, `DiffusionGuidance.load`, `check_views` and
@@ -115,6 +119,9 @@ def prepare_appearance(
     part_material(scene, config.appearance.fixed, config.appearance.normal_map)
     if config.appearance.lambda_sds == 0:
         return None
+    if given is not None:
+        check_views(AppearanceStage.name, config, given)
+        return with_prompt(given, scene, say_of_prompt)
     if shared is None:
         guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
     else:

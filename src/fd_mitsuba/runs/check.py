@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
@@ -226,6 +226,7 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
             warnings.append(f"no material can be learned, only a shape (--stage geometry): {error}")
     else:
         warnings.append("no emitter: previews use a lamp of their own; add an envmap for the appearance")
+    warnings += misfits(config)
     if config.geometry.lambda_focal == 0:
         warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")
     return warnings

@@ -19,6 +19,7 @@ from fd_mitsuba.export.part_record import part_file, part_record
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
@@ -34,14 +35,21 @@ from fd_mitsuba.viewing.turntable import render_ring, write_sheet, write_video
 _SHEET_VIEWS = 8
 
 
-def prepare_geometry(scene: EditScene, config: RunConfig, say: Callable[[str], None]) -> DiffusionGuidance | None:
+def prepare_geometry(
+    scene: EditScene, config: RunConfig, say: Callable[[str], None], given: Guidance | None = None
+) -> Guidance | None:
     """The guidance of the geometry stage with the scene's prompt; None where it has no weight.
+
+    Args:
+        given: a caller's own guidance, in place of the one that `guidance.model` names.
 
     Raises:
         UserError: a model that cannot be loaded, a prompt that it does not know, a cut that it cannot guide.
     """
     if config.geometry.lambda_sds == 0:
         return None
+    if given is not None:
+        return with_prompt(given, scene, say)
     guidance = DiffusionGuidance.load(config.guidance)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(
@@ -50,6 +58,14 @@ def prepare_geometry(scene: EditScene, config: RunConfig, say: Callable[[str], N
         )
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say)
     return guidance
+
+
+def with_prompt(given: Guidance | AppearanceGuidance, scene: EditScene, say: Callable[[str], None]) -> Any:
+    """A caller's own guidance with the scene's prompts; the words that it does not know are said."""
+    unknown = given.set_prompt(scene.prompt, scene.negative_prompt)
+    if unknown:
+        say(f"{type(given).__name__} does not know {', '.join(map(repr, unknown))}")
+    return given
 
 
 def refuse_other_shape(before: EditScene, now: EditScene, source: Path) -> None:

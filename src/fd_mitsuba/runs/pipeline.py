@@ -1,4 +1,4 @@
-"""Scene and settings in, run folder out: what `fd_mitsuba run` does, as a Python API."""
+"""Scene and settings in, run folder out: what `fd_mitsuba run` and `api.edit` do."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from fd_mitsuba.export.part_record import part_record
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.export.solid.solid import LEAST_FACES
 from fd_mitsuba.fields.texture import TextureField
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.appearance_outcome import (
     CUTS_UNKNOWN,
@@ -34,12 +36,14 @@ from fd_mitsuba.runs.geometry_outcome import (
     removed_parts,
     take_geometry,
 )
+from fd_mitsuba.runs.outcome_warnings import outcome_warnings
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
+from fd_mitsuba.training.stage import OnStep
 
 STAGES = ("geometry", "appearance")
 
@@ -54,6 +58,8 @@ def run(
     say: Callable[[str], None] = print,
     stages: Collection[str] = STAGES,
     geometry_from: Path | None = None,
+    guidance: Guidance | None = None,
+    on_step: OnStep | None = None,
 ) -> dict:
     """Grow the part, give it its material, and write the run folder; returns what `metrics.json` holds.
 
@@ -64,6 +70,9 @@ def run(
         say: takes remarks for the user, a line each.
         stages: which of `STAGES` to run. The appearance stage alone needs a folder whose geometry stage is finished.
         geometry_from: another run folder, whose finished geometry is taken over instead of running that stage.
+        guidance: a caller's own, in place of the model that the settings name. The appearance stage takes it too where
+            it has `guide_appearance`, and otherwise loads the settings' model.
+        on_step: called after each finished step of either stage.
 
     Raises:
         UserError, RunStopped, Interrupted: see `training.loop.run_stage`. A run that ends with an error before its
@@ -79,15 +88,19 @@ def run(
     with_geometry = "geometry" in stages and geometry_from is None
     check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
     # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
-    guidance = prepare_geometry(scene, config, say) if with_geometry else None
-    # Both priors know the same words: what the geometry stage has said of them is not said again.
-    listener = (lambda line: None) if guidance is not None else say
-    for_appearance = prepare_appearance(scene, config, say, listener, guidance) if "appearance" in stages else None
+    for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None
+    for_appearance = None
+    if "appearance" in stages:
+        # Both priors know the same words: what the geometry stage has said of them is not said again.
+        listener = (lambda line: None) if for_geometry is not None else say
+        loaded = for_geometry if isinstance(for_geometry, DiffusionGuidance) and guidance is None else None
+        own = guidance if hasattr(guidance, "guide_appearance") else None
+        for_appearance = prepare_appearance(scene, config, say, listener, loaded, own)
     if with_geometry:
-        geometry = GeometryStage(scene, config, guidance)
+        geometry = GeometryStage(scene, config, for_geometry)
         with discarded_without_checkpoint(folder):
             describe_run(scene, config, folder, command)
-            run_stage(geometry, folder, resume, quiet, say)
+            run_stage(geometry, folder, resume, quiet, say, on_step)
     elif geometry_from is not None:
         refuse_other_shape(saved_run(geometry_from)[0], scene, geometry_from)
         geometry = load_finished_stage(scene, config, geometry_from)
@@ -97,6 +110,8 @@ def run(
         geometry = load_finished_stage(scene, config, folder)
     with rendering_threads():
         metrics = export_geometry(geometry, folder)
+    if guidance is not None:
+        metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
 
     def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)
@@ -109,13 +124,14 @@ def run(
         appearance = AppearanceStage(
             scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
         )
-        run_stage(appearance, folder, resume, quiet, say)
+        run_stage(appearance, folder, resume, quiet, say, on_step)
         with rendering_threads():
             field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
         write_metrics()
     if with_assets:
         with rendering_threads():
             write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+    metrics["warnings"] = outcome_warnings(metrics)
     # Written last of all: a folder without it is not finished.
     done = {"geometry", *stages}
     metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}

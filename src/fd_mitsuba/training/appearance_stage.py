@@ -8,7 +8,7 @@ from the scene file alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
 from fd_mitsuba.training.style_consistency import StyleConsistency, learn_base_material
 from fd_mitsuba.training.surface_points import points_on
@@ -42,22 +43,6 @@ _POOL = 32768
 """Points on the parts' surface that the style losses choose from."""
 _INITIAL_STEPS = 300
 """Steps in which the single path's field learns the base's own material before the guidance starts."""
-
-
-@dataclass(frozen=True)
-class AppearanceRecord:
-    """What one step reports: numbers, the linear pictures without gradients, and what the field said at the points."""
-
-    values: dict[str, float]
-    gbuffer: GBuffer
-    pictures: AppearancePictures
-    texture: TextureValues
-    exposure: float
-    preview: Tensor | None
-
-    def sheet(self) -> np.ndarray | None:
-        """The views, both paths, the mask, the field's maps, and the guidance's estimate."""
-        return appearance_sheet(self.gbuffer, self.pictures, self.texture, self.exposure, self.preview)
 
 
 class AppearanceStage:
@@ -129,7 +114,7 @@ class AppearanceStage:
         normal = texture.normal if "normal" in self.material.learned else None
         return self.rendering.render(gbuffer, **fed, normal=normal, seed=seed)
 
-    def step(self, step: int) -> AppearanceRecord:
+    def step(self, step: int) -> StepRecord:
         """Run step `step` (counted from 0) and change the field once.
 
         Raises:
@@ -171,7 +156,7 @@ class AppearanceStage:
         }
         values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
         shown = _detached(pictures), _without_gradient(texture)
-        return AppearanceRecord(values, gbuffer, *shown, self.exposure, preview)
+        return StepRecord(values, partial(appearance_sheet, gbuffer, *shown, self.exposure, preview))
 
     def check_field(self, step: int) -> dict[str, float]:
         """The parts' mean base colour, roughness and metallic; raises RunStopped for a field that is not finite."""

@@ -6,7 +6,7 @@ optional price on the part's volume, on empty regions and on loose pieces. A wei
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
 from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
 from fd_mitsuba.viewing.sheets import geometry_sheet
 
@@ -35,25 +36,6 @@ VANISHED_AFTER = 25
 """Steps in a row without any visible part before the run is stopped."""
 EXPLODED_BEYOND = 1.0
 """A signed distance further than this from where it started, canonical units, is no shape any more."""
-
-
-@dataclass(frozen=True)
-class StepRecord:
-    """What one step reports.
-
-    Attributes:
-        values: numbers for the metrics file and the progress line.
-        pictures: the step's geometry pictures (B, 5, H, W), without gradients.
-        preview: the guidance's estimate of clean latents, or None.
-    """
-
-    values: dict[str, float]
-    pictures: Tensor
-    preview: Tensor | None
-
-    def sheet(self) -> np.ndarray | None:
-        """Normals, part masks, and the guidance's estimate."""
-        return geometry_sheet(self.pictures, self.preview)
 
 
 class GeometryStage:
@@ -163,7 +145,7 @@ class GeometryStage:
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
         values["part_faces"] = float(surface.face_is_part.sum())
-        return StepRecord(values, pictures.detach(), preview)
+        return StepRecord(values, partial(geometry_sheet, pictures.detach(), preview))
 
     def check_field(self, step: int) -> dict[str, float]:
         """The part's volume over the focal regions'; raises RunStopped for a field not finite, exploded or empty."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from fd_mitsuba.errors import Interrupted
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, load_newest, save_checkpoint
 from fd_mitsuba.training.record import Recorder
-from fd_mitsuba.training.stage import Stage
+from fd_mitsuba.training.stage import OnStep, Stage, StepUpdate
 from fd_mitsuba.training.stop_request import stop_on_signals
 
 _FIELD_CHECKED_EVERY = 10
@@ -20,6 +20,7 @@ def run_stage(
     resume: bool = False,
     quiet: bool = False,
     say: Callable[[str], None] = print,
+    on_step: OnStep | None = None,
 ) -> None:
     """Train until the last step; the newest checkpoint in the stage's `checkpoint_folder` then holds the result.
 
@@ -27,6 +28,7 @@ def run_stage(
         stage: fresh; a checkpoint is loaded into it if `resume`.
         folder: the run folder.
         say: takes remarks for the user, a line each.
+        on_step: called after each finished step, saved or not.
 
     Raises:
         Interrupted: after SIGINT or SIGTERM, with a checkpoint of the last finished step.
@@ -56,11 +58,14 @@ def run_stage(
             values = dict(record.values)
             if saving or finished % _FIELD_CHECKED_EVERY == 0:
                 values.update(stage.check_field(finished))
-            recorder.row(finished, stage.phase_name(step), values)
+            phase = stage.phase_name(step)
+            recorder.row(finished, phase, values)
             every = config.output.sheet_every
             if every and (finished % every == 0 or last) and (sheet := record.sheet()) is not None:
                 recorder.sheet(finished, sheet)
             if saving:
                 save(finished)
+            if on_step is not None:
+                on_step(StepUpdate(stage.name, phase, finished, total, values, stage))
             if stopped_by is not None:
                 raise Interrupted(f"{stopped_by}: stopped after step {finished} of {total}; continue with --resume")

@@ -1,7 +1,9 @@
-"""What the loop knows of a stage."""
+"""What the loop knows of a stage, and what it tells a caller after each step."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -10,15 +12,18 @@ import torch
 from fd_mitsuba.config import RunConfig
 
 
-class StepRecord(Protocol):
-    """What one step reports."""
+@dataclass(frozen=True)
+class StepRecord:
+    """What one step reports.
+
+    Attributes:
+        values: numbers for the metrics file and the progress line.
+        sheet: makes a picture (H, W, 3) uint8 of the step, or None if there is nothing to see; called only when a
+            contact sheet is due.
+    """
 
     values: dict[str, float]
-    """Numbers for the metrics file and the progress line."""
-
-    def sheet(self) -> np.ndarray | None:
-        """A picture (H, W, 3) uint8 of the step, or None if there is nothing to see."""
-        ...
+    sheet: Callable[[], np.ndarray | None]
 
 
 class Stage(Protocol):
@@ -43,3 +48,26 @@ class Stage(Protocol):
     def phase_name(self, step: int) -> str:
         """What the progress line calls this part of the stage."""
         ...
+
+
+@dataclass(frozen=True)
+class StepUpdate:
+    """What `on_step` is told after each finished step.
+
+    Attributes:
+        stage, phase: names, such as `geometry` and `coarse`.
+        step: finished steps, from 1 to `total`.
+        values: losses and other numbers, as in `metrics.jsonl`.
+        live: the stage itself, to be looked at and not changed: `live.surface()` is the geometry stage's mesh.
+    """
+
+    stage: str
+    phase: str
+    step: int
+    total: int
+    values: dict[str, float]
+    live: Stage
+
+
+OnStep = Callable[[StepUpdate], None]
+"""Called in the training loop: what it raises ends the run, what it takes long for delays the next step."""

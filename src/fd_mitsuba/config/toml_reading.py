@@ -1,4 +1,4 @@
-"""Settings read from TOML and overridden by `--set`; whatever is wrong becomes one line that names it."""
+"""Settings as text: TOML files, shipped ones by name, overrides as of `--set`, and one line for what is wrong."""
 
 from __future__ import annotations
 
@@ -9,38 +9,42 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from fd_mitsuba.config.run_config import RunConfig
 from fd_mitsuba.errors import UserError
 
+PRESETS_FOLDER = Path(__file__).with_name("presets")
 
-def load_config(path: Path | str | None, overrides: list[str] | tuple[str, ...] = ()) -> RunConfig:
-    """The settings of a TOML file (None: the defaults, which are the paper's) after `section.key=value` overrides.
 
-    Values of overrides are read as TOML, and as plain text where they are not TOML.
+def preset_names() -> list[str]:
+    """Names of the settings that ship with the package: `paper`, `quick`, `smoke`."""
+    return sorted(path.stem for path in PRESETS_FOLDER.glob("*.toml"))
+
+
+def locate_settings(source: str | Path) -> Path:
+    """The file of a shipped name such as `quick`, or the path itself; a file of that name here goes before."""
+    path = Path(source)
+    shipped = PRESETS_FOLDER / f"{source}.toml"
+    return shipped if not path.is_file() and path.name == str(source) and shipped.is_file() else path
+
+
+def read_toml(source: str | Path) -> dict[str, Any]:
+    """The content of a TOML file or of shipped settings.
 
     Raises:
-        UserError: unreadable file, unknown section or key, value of the wrong type or out of range.
+        UserError: no such file or name, unreadable, not TOML.
     """
-    data: dict[str, Any] = {}
-    if path is not None:
-        try:
-            data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UserError(f"{path}: no such config file; give a path such as configs/quick.toml") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: cannot be read ({error}); give a readable TOML file") from None
-        except tomllib.TOMLDecodeError as error:
-            raise UserError(f"{path}: not valid TOML ({error}); mend that line") from None
-    items = {_apply_override(data, item): item for item in overrides}
+    path = locate_settings(source)
     try:
-        return RunConfig.model_validate(data)
-    except ValidationError as error:
-        item = _guilty_override(error, items)
-        source = f"--set {item}" if item is not None else path or "--set"
-        raise UserError(f"{source}: {_first_problem(error)}") from None
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        known = ", ".join(preset_names())
+        raise UserError(f"{source}: no such config file; give one of {known}, or the path of a TOML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{source}: cannot be read ({error}); give a readable TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{source}: not valid TOML ({error}); mend that line") from None
 
 
-def _apply_override(data: dict[str, Any], item: str) -> str:
+def apply_override(data: dict[str, Any], item: str) -> str:
     """Write the override's value into `data`; returns its key without blanks."""
     key, separator, text = item.partition("=")
     key, text = key.strip(), text.strip()
@@ -60,7 +64,7 @@ def _apply_override(data: dict[str, Any], item: str) -> str:
     return ".".join([*sections, name])
 
 
-def _guilty_override(error: ValidationError, items: dict[str, str]) -> str | None:
+def guilty_override(error: ValidationError, items: dict[str, str]) -> str | None:
     """The last `--set` that wrote the value which the first problem is about; None: the value is the file's."""
     problem = error.errors()[0]
     place = ".".join(str(part) for part in problem["loc"])
@@ -72,22 +76,22 @@ def _guilty_override(error: ValidationError, items: dict[str, str]) -> str | Non
     return None
 
 
-def _first_problem(error: ValidationError) -> str:
+def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     problem = error.errors()[0]
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "value_error":  # our own words, about several values
         return f"{problem['ctx']['error']}; change the value"
     if problem["type"] == "extra_forbidden":
-        known = _known_keys() if "." in key else list(RunConfig.model_fields)
+        known = _known_keys(model) if "." in key else list(model.model_fields)
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.4)
-        hint = f"nearest: {', '.join(near)}" if near else f"sections: {', '.join(RunConfig.model_fields)}"
+        hint = f"nearest: {', '.join(near)}" if near else f"sections: {', '.join(model.model_fields)}"
         return f"unknown key {key!r}; {hint}"
     return f"{key + ': ' if key else ''}{problem['msg']} (given: {str(problem['input'])[:60]!r}); change the value"
 
 
-def _known_keys() -> list[str]:
+def _known_keys(model: type[BaseModel]) -> list[str]:
     keys = []
-    for name, info in RunConfig.model_fields.items():
+    for name, info in model.model_fields.items():
         if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
             keys += [f"{name}.{inner}" for inner in info.annotation.model_fields]
         else:

@@ -1,0 +1,153 @@
+"""The package's public functions: load a scene, edit it, evaluate the outcome. The command line calls nothing else.
+
+Example:
+    import fd_mitsuba as fd
+
+    scene = fd.load_scene("scenes/cat/scene.xml", prompt="a cat with a crown")
+    run = fd.edit(scene, fd.Config.load("quick"), output="runs/crown")
+    run.part().export("crown.stl")
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fd_mitsuba.backend.startup import DEFAULT_VARIANT
+from fd_mitsuba.config import RunConfig, misfits, settings_for_run
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.runs.run import Run
+
+if TYPE_CHECKING:
+    from fd_mitsuba.guidance.interface import Guidance
+    from fd_mitsuba.scene.edit_scene import EditScene
+    from fd_mitsuba.training.stage import OnStep
+
+STAGES = ("geometry", "appearance")
+
+
+def load_scene(
+    path: Path | str,
+    parameters: Mapping[str, str] | None = None,
+    *,
+    prompt: str | None = None,
+    regions: Path | str | None = None,
+    threads: int = 0,
+    variant: str = DEFAULT_VARIANT,
+    on_misplaced: Callable[[UserError], None] | None = None,
+) -> EditScene:
+    """Read a scene and start Mitsuba if it has not been started.
+
+    Args:
+        path: a Mitsuba scene (XML) with focal regions and a prompt.
+        parameters: values for `$name`, as `-D name=value`.
+        prompt: in place of the scene's.
+        regions: an XML file with focal regions, such as for a scene that was exported.
+        threads: cores to use; 0: all; 1: results that are the same bytes at every run. Import torch after this call.
+        variant: Mitsuba's.
+        on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
+
+    Raises:
+        UserError: whatever is wrong with the scene, in one line with file, element and remedy.
+    """
+    from fd_mitsuba.backend.threads import share_cores
+
+    words = None if prompt is None else " ".join(prompt.split())
+    if words == "":
+        raise UserError("prompt: is blank; say what the edited object looks like")
+    if threads < 0:
+        raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
+    share_cores(threads, variant)
+    from fd_mitsuba.scene.edit_scene import load_edit_scene
+
+    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced)
+
+
+def edit(
+    scene: EditScene | Path | str,
+    config: RunConfig | None = None,
+    *,
+    output: Path | str,
+    guidance: Guidance | None = None,
+    on_step: OnStep | None = None,
+    resume: bool = False,
+    quiet: bool = False,
+    stages: Collection[str] = STAGES,
+    geometry_from: Path | str | None = None,
+    say: Callable[[str], None] | None = None,
+    command: str = "",
+) -> Run:
+    """Grow the part that a scene asks for, give it its material, write the run folder with all exports and its report.
+
+    Args:
+        scene: from `load_scene`, or a path.
+        config: settings; None: those that suit the built-in prior.
+        output: the run folder; must be new or empty, or hold a run to go on with.
+        guidance: any object with the methods of `guidance.interface.Guidance`, in place of the model that the settings
+            name. With `guide_appearance` it serves the appearance stage as well.
+        on_step: called with a `StepUpdate` after each finished step.
+        resume: go on with the run in `output`.
+        quiet: no progress display, no remarks.
+        stages: which of `geometry` and `appearance` to run.
+        geometry_from: another run of this scene, whose finished geometry is taken over.
+        say: takes remarks, a line each; None: they go to stderr unless `quiet`.
+        command: for the record in the run folder.
+
+    Raises:
+        UserError: bad input; `RunStopped` if a run cannot go on, `Interrupted` after SIGINT or SIGTERM.
+    """
+    if say is None:
+        say = _nothing if quiet else _to_stderr
+    if isinstance(scene, (str, Path)):
+        scene = load_scene(scene)
+    if config is None:
+        chosen = settings_for_run(None)
+        config = chosen.config
+        say(str(chosen.remark))
+    unknown = set(stages) - set(STAGES)
+    if unknown or not stages:
+        raise UserError(f"stages = {sorted(stages)}: give any of {', '.join(STAGES)}")
+    if guidance is None:
+        for line in misfits(config):
+            say(f"warning: {line}")
+    from fd_mitsuba.evaluation.report.run_page import reported
+    from fd_mitsuba.runs.pipeline import run
+
+    folder = Path(output)
+    taken = None if geometry_from is None else Path(geometry_from)
+    with reported(folder, say):
+        run(scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step)
+    result = Run(folder)
+    for warning in result.warnings:
+        say(f"warning: {warning}")
+    return result
+
+
+def evaluate(run: Run | Path | str, *, judge: str | None = None, **protocol: Any) -> dict[str, Any]:
+    """The metrics of a finished run: CLIP scores, base preservation, leakage; also written to `evaluation.json`.
+
+    Args:
+        judge: a CLIP model by folder or hub id; None: the built-in evaluator.
+        protocol: `views`, `size`, `spp`, `pictures` as in `evaluation.run_evaluation.Protocol`.
+
+    Raises:
+        UserError: no finished run there, a model that cannot be loaded.
+    """
+    from fd_mitsuba.backend.threads import share_cores_once
+
+    share_cores_once()
+    from fd_mitsuba.evaluation.clip import ClipJudge
+    from fd_mitsuba.evaluation.run_evaluation import Protocol, evaluate_run
+
+    folder = run.folder if isinstance(run, Run) else Path(run)
+    return evaluate_run(folder, ClipJudge.load(judge), Protocol(**protocol))
+
+
+def _nothing(line: str) -> None:
+    pass
+
+
+def _to_stderr(line: str) -> None:
+    print(f"fd_mitsuba: {line}", file=sys.stderr)

@@ -1,0 +1,27 @@
+"""The command `check`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
+
+
+def add_check_command(commands: argparse._SubParsersAction) -> None:
+    """Put `check` beside the other commands."""
+    check = commands.add_parser("check", help="examine a scene before a run")
+    scene_options(check)
+    settings_options(check)
+    check.add_argument("--json", action="store_true", help="machine-readable")
+    check.set_defaults(call=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    config = chosen_settings(options)
+    scene = load(options)
+    from fd_mitsuba.runs.check import check_scene
+
+    report = check_scene(scene, config)
+    print(json.dumps(report.to_json(), indent=2) if options.json else "\n".join(report.lines()))
+    return 0

@@ -1,0 +1,31 @@
+"""The command `preview`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fd_mitsuba.cli.scene_options import load, scene_options
+from fd_mitsuba.errors import UserError
+
+
+def add_preview_command(commands: argparse._SubParsersAction) -> None:
+    """Put `preview` beside the other commands."""
+    preview = commands.add_parser("preview", help="pictures of the base with the focal regions drawn in")
+    scene_options(preview)
+    preview.add_argument("-o", "--output", metavar="FOLDER", help="default: runs/<scene>_preview")
+    preview.set_defaults(call=_preview)
+
+
+def _preview(options: argparse.Namespace) -> int:
+    misplaced: list[UserError] = []
+    scene = load(options, misplaced.append)
+    from fd_mitsuba.viewing.preview import preview_scene
+
+    name = Path(options.scene).resolve().parent.name
+    folder = Path(options.output) if options.output else Path("runs") / f"{name}_preview"
+    for path in preview_scene(scene, folder):
+        print(path)
+    if misplaced:
+        raise misplaced[0]
+    return 0

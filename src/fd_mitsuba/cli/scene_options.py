@@ -1,0 +1,67 @@
+"""What the commands that take a scene have in common: its options, how it is loaded, the settings beside it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from fd_mitsuba.cli.options import definitions, machine_options, quiet_libraries, remark
+from fd_mitsuba.errors import UserError
+
+if TYPE_CHECKING:
+    from fd_mitsuba.config import RunConfig
+    from fd_mitsuba.scene.edit_scene import EditScene
+
+
+def scene_options(parser: argparse.ArgumentParser) -> None:
+    """The scene, -D, --prompt, --regions, and the machine's options."""
+    parser.add_argument("scene", help="Mitsuba scene file (XML)")
+    parser.add_argument(
+        "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
+    )
+    parser.add_argument("--prompt", help="instead of the scene's prompt")
+    parser.add_argument(
+        "--regions", metavar="FILE", help="an XML file with focal regions, such as for a scene that was exported"
+    )
+    machine_options(parser)
+
+
+def settings_options(parser: argparse.ArgumentParser) -> None:
+    """-c and --set."""
+    parser.add_argument(
+        "-c",
+        "--config",
+        metavar="FILE|NAME",
+        help="settings: a TOML file, or quick, paper, smoke; default: quick with the built-in prior, else paper",
+    )
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting"
+    )
+
+
+def chosen_settings(options: argparse.Namespace) -> RunConfig:
+    """The settings that the options ask for; how they were chosen, where the options do not say, goes to stderr."""
+    from fd_mitsuba.config import settings_for_run
+
+    chosen = settings_for_run(options.config, options.overrides)
+    if chosen.remark:
+        remark(chosen.remark)
+    return chosen.config
+
+
+def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:
+    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `api.load_scene`."""
+    parameters = definitions(options)
+    quiet_libraries(options)
+    from fd_mitsuba.api import load_scene
+
+    return load_scene(
+        options.scene,
+        parameters,
+        prompt=options.prompt,
+        regions=options.regions,
+        threads=options.threads,
+        variant=options.variant,
+        on_misplaced=on_misplaced,
+    )

@@ -1,0 +1,97 @@
+"""Which settings suit which guidance model: the choice where the user makes none, a warning where theirs do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fd_mitsuba.config.run_config import RunConfig
+from fd_mitsuba.config.sections import GuidanceConfig
+from fd_mitsuba.config.toml_reading import apply_override, read_toml
+
+SMALL_PRESET, LARGE_PRESET = "quick", "paper"
+_CONVENTIONS_NAME = "fd_mitsuba.json"
+"""A pipeline folder with this file was made by `prior pack`: a small prior, as the built-in one is."""
+
+
+@dataclass(frozen=True)
+class ChosenSettings:
+    """Settings of a run, and how they were chosen where the user did not choose."""
+
+    config: RunConfig
+    remark: str | None
+
+
+def is_small_prior(model: str) -> bool:
+    """Whether `guidance.model` is the built-in prior or one that was packed like it."""
+    return model == "builtin" or (Path(model).expanduser() / _CONVENTIONS_NAME).is_file()
+
+
+def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -> ChosenSettings:
+    """The settings that the user chose; without a choice those that suit the guidance model, which is said in a line.
+
+    Args:
+        choice: as `source` of `RunConfig.load`; None: `quick` for the built-in prior and its like, `paper` otherwise.
+
+    Raises:
+        UserError: see `RunConfig.load`.
+    """
+    remark = None
+    if choice is None:
+        wanted: dict[str, Any] = {}
+        for item in overrides:
+            apply_override(wanted, item)
+        guidance = wanted.get("guidance")
+        model = str(guidance.get("model", "builtin")) if isinstance(guidance, dict) else "builtin"
+        choice = SMALL_PRESET if is_small_prior(model) else LARGE_PRESET
+        whom = "the built-in prior" if model == "builtin" else model
+        remark = f"settings: {choice}, which suit {whom}; -c chooses others"
+    return ChosenSettings(RunConfig.load(choice, overrides), remark)
+
+
+def misfits(config: RunConfig) -> list[str]:
+    """A line that names the settings which do not fit the guidance model; none where all do."""
+    small = is_small_prior(config.guidance.model)
+    if config.geometry.lambda_sds == 0 and config.appearance.lambda_sds == 0:
+        return []
+    rules = _SMALL if small else _LARGE
+    wrong = [(key, _value(config, key)) for key, fits in rules.items() if not fits(_value(config, key))]
+    if config.guidance.variant != GuidanceConfig().variant:  # each variant has a scale of its own
+        wrong = [(key, value) for key, value in wrong if key != "guidance.guidance_scale"]
+    if not wrong:
+        return []
+    preset = SMALL_PRESET if small else LARGE_PRESET
+    usual = RunConfig.load(read_toml(preset))
+    named = ", ".join(f"{key} = {_text(value)} ({preset}: {_text(_value(usual, key))})" for key, value in wrong)
+    whom = "the built-in prior" if config.guidance.model == "builtin" else config.guidance.model
+    other = "name a Stable Diffusion model in guidance.model" if small else "set guidance.model=builtin"
+    return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}"]
+
+
+_SMALL: dict[str, Callable[[Any], bool]] = {
+    "guidance.guidance_scale": lambda scale: scale <= 20,
+    "guidance.timestep_range_coarse": lambda bounds: bounds[1] >= 0.6,
+    "guidance.normalise_gradient": lambda normalised: normalised,
+    "appearance.guidance_scale": lambda scale: scale <= 10,
+    "appearance.background": lambda colour: colour == "black",
+}
+"""The built-in prior decides at high noise what a part becomes, and its gradient is small: see docs/prior.md."""
+_LARGE: dict[str, Callable[[Any], bool]] = {
+    "guidance.guidance_scale": lambda scale: scale >= 7,
+    "field.finest_resolution": lambda cells: cells >= 64,
+    "appearance.guidance_scale": lambda scale: scale >= 7,
+}
+"""With the small scales of the built-in prior, score distillation of Stable Diffusion stays a blur (DreamFusion)."""
+
+
+def _value(config: RunConfig, key: str) -> Any:
+    section, name = key.split(".")
+    return getattr(getattr(config, section), name)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,42 @@
+"""What is wrong with a finished run, as far as its metrics show it, and what to do about it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+LEAST_INSIDE = 0.9
+"""Share of the part that must lie in its focal regions."""
+MOST_BURIED = 0.5
+"""Share of the part that may lie inside the base."""
+_OTHER_SEED = "try another seed (--set seed=1)"
+
+
+def outcome_warnings(metrics: dict[str, Any]) -> list[str]:
+    """Lines for the user about a part that should be looked at before it is used; none for a part without a fault.
+
+    Args:
+        metrics: what `metrics.json` holds; keys that are missing are passed over.
+    """
+    warnings = []
+    inside, buried = metrics.get("inside_fraction", 1.0), metrics.get("overlap_fraction", 0.0)
+    gap, islands = metrics.get("gap", 0.0), metrics.get("islands_removed", 0)
+    if inside < LEAST_INSIDE:
+        warnings.append(
+            f"only {inside:.1%} of the part lies in its focal regions: enlarge them, raise geometry.lambda_focal, "
+            f"or {_OTHER_SEED}"
+        )
+    if buried > MOST_BURIED:
+        warnings.append(
+            f"{buried:.0%} of the part lies inside the base, where it is not seen: move the regions outwards"
+        )
+    if gap > 0:
+        warnings.append(
+            f"a piece of the part is {gap:.3g} away from the base (its longest side is 1.8): move the regions until "
+            f"they reach into the base, raise geometry.lambda_tether, or {_OTHER_SEED}"
+        )
+    if islands:
+        pieces = "a loose piece" if islands == 1 else f"{islands} loose pieces"
+        warnings.append(f"{pieces} of the part too small to be meant left out of the export: {_OTHER_SEED}")
+    if not metrics.get("manifold", True):
+        warnings.append("the part's mesh is not a closed manifold: it may fail in booleans and 3D printing")
+    return warnings

@@ -1,0 +1,30 @@
+"""What the end of a run warns of, by its metrics."""
+
+from __future__ import annotations
+
+import pytest
+
+from fd_mitsuba.runs.outcome_warnings import outcome_warnings
+
+GOOD = {"inside_fraction": 0.99, "overlap_fraction": 0.01, "gap": 0.0, "islands_removed": 0, "manifold": True}
+
+
+def test_nothing_is_said_of_a_good_part() -> None:
+    assert outcome_warnings(GOOD) == [] and outcome_warnings({}) == []
+
+
+@pytest.mark.parametrize(
+    "fault, named",
+    [
+        ({"inside_fraction": 0.495}, ("49.5 %", "focal regions", "seed=1")),
+        ({"overlap_fraction": 0.8}, ("80 %", "inside the base")),
+        ({"gap": 0.276}, ("0.276", "away from the base")),
+        ({"islands_removed": 2}, ("2 loose pieces",)),
+        ({"islands_removed": 1}, ("a loose piece",)),
+        ({"manifold": False}, ("manifold",)),
+    ],
+)
+def test_each_fault_is_one_line_with_a_remedy(fault: dict, named: tuple[str, ...]) -> None:
+    (line,) = outcome_warnings(GOOD | fault)
+    assert all(text.replace(" %", "%") in line or text in line for text in named)
+    assert ":" in line and "\n" not in line
