@@ -5,7 +5,7 @@
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
 SCENE ?= scenes/cat/scene.xml
-CONFIG ?= configs/quick.toml
+CONFIG ?= quick
 OUT ?= runs/demo
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=

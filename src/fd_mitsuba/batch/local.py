@@ -1,6 +1,6 @@
 """Many runs: scenes by settings by seeds, on this machine or on a Ray cluster; what is finished is not done again.
 
-jobs = job_matrix([Path("scenes/cat/scene.xml")], [Path("configs/quick.toml")], [0, 1, 2], (), Path("runs/cats"))
+jobs = job_matrix([Path("scenes/cat/scene.xml")], [Path("quick")], [0, 1, 2], (), Path("runs/cats"))
 outcomes = run_batch(jobs, workers=2, record=Path("runs/cats/batch.json"))
 """
 
