@@ -33,5 +33,8 @@ TextureChannel = Literal["base_color", "roughness", "metallic", "normal"]
 TEXTURE_CHANNELS: tuple[TextureChannel, ...] = get_args(TextureChannel)
 """What a texture field says at a point: kd, the two of krm, kn."""
 
+Weighting = Literal["sds", "uniform", "fantasia3d", "inverse"]
+"""Names of w(t); `guidance.sds.weight` has the formulas."""
+
 BASE_NAME = "base"
 DEFAULT_PART_NAME = "part"

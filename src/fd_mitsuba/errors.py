@@ -16,3 +16,9 @@ class RunStopped(UserError):
 
 class Interrupted(Exception):
     """SIGINT or SIGTERM after the checkpoint was written. Exit code 130."""
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of another library's message, or the error's type where it has none."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if lines else type(error).__name__)[:200]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from fd_mitsuba.conventions import TextureChannel
+from fd_mitsuba.conventions import TextureChannel, Weighting
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -113,7 +113,7 @@ class AppearanceConfig(Section):
     fixed: tuple[TextureChannel, ...] = ()
     """Channels that keep the values of the scene's part BSDF."""
     timestep_range: Range = (0.02, 0.98)
-    weighting: Literal["sds", "uniform", "fantasia3d", "inverse"] = "inverse"
+    weighting: Weighting = "inverse"
     guidance_scale: NonNegative = 100.0
     image_guidance_scale: NonNegative = 1.0
     mask_guidance: bool = True
@@ -158,7 +158,7 @@ class GuidanceConfig(Section):
     guidance_scale: NonNegative = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: NonNegative = 1.0
-    weighting: Literal["sds", "uniform", "fantasia3d", "inverse"] = "sds"
+    weighting: Weighting = "sds"
     timestep_range_coarse: Range = (0.02, 0.35)
     timestep_range_refined: Range = (0.02, 0.35)
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.guidance.builtin import verify_hashes
-from fd_mitsuba.guidance.layout import first_line, read_json
+from fd_mitsuba.guidance.layout import read_json
+from fd_mitsuba.io.hub import hub_snapshot, local_folder
 
 EVALUATOR_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "evaluator"
 BUILTIN_NAME = "built-in evaluator"
@@ -51,13 +50,8 @@ def locate_clip(model: str | None) -> tuple[Path, str]:
             )
         verify_hashes(EVALUATOR_FOLDER)
         return EVALUATOR_FOLDER, BUILTIN_NAME
-    folder = Path(model).expanduser()
-    if folder.is_dir():
-        return folder, model
-    if folder.exists() or not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", model):
-        problem = "is a file" if folder.exists() else "no such folder"
-        raise UserError(f"{model}: {problem}; name a folder in Transformers' CLIP layout or a hub id owner/name")
-    return _snapshot(model), model
+    folder = local_folder(model, "--judge", "Transformers' CLIP layout")
+    return _snapshot(model) if folder is None else folder, model
 
 
 def read_clip_conventions(folder: Path) -> dict[str, Any]:
@@ -130,19 +124,8 @@ def _no_progress_bar() -> Iterator[None]:
 
 
 def _snapshot(model: str) -> Path:
-    from huggingface_hub import constants, snapshot_download
-
-    offline = constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on")
-    try:
-        folder = Path(snapshot_download(model, allow_patterns=_HUB_FILES, local_files_only=offline))
-        if not list(folder.glob("model*.safetensors*")):
-            # The first CLIP models have pickled weights alone; Transformers reads them without running what they hold.
-            files = [*_HUB_FILES, "pytorch_model.bin"]
-            folder = Path(snapshot_download(model, allow_patterns=files, local_files_only=offline))
-        return folder
-    except Exception as error:  # the hub client raises many kinds: unknown id, gated, no network, disk full
-        reason = "HF_HUB_OFFLINE is set and it is not in the cache" if offline else first_line(error)
-        raise UserError(
-            f"{model}: neither a folder here nor a CLIP model from the hub ({reason}); give a folder, or fetch the "
-            "model once while online"
-        ) from None
+    folder = hub_snapshot(model, _HUB_FILES)
+    if not list(folder.glob("model*.safetensors*")):
+        # The first CLIP models have pickled weights alone; Transformers reads them without running what they hold.
+        folder = hub_snapshot(model, [*_HUB_FILES, "pytorch_model.bin"])
+    return folder

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
 
 LAYOUT = "only Stable Diffusion 1.x/2.x and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
@@ -141,8 +141,3 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise UserError(f"{path}: must hold a JSON object; copy or fetch the file again")
     return data
-
-
-def first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines[0] if lines else type(error).__name__)[:200]

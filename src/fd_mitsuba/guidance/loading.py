@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +11,13 @@ from typing import Any
 import torch
 
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
     WEIGHTS,
     check_sizes,
     count_weights,
-    first_line,
     latent_side,
     read_json,
     read_layout,
@@ -28,6 +25,7 @@ from fd_mitsuba.guidance.layout import (
 )
 from fd_mitsuba.guidance.memory import BYTES, require_memory, working_set_bytes
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
+from fd_mitsuba.io.hub import hub_snapshot, is_offline, local_folder
 
 HUB_FILES = ["model_index.json", FILE_NAME, "tokenizer/*", "scheduler/*.json"] + [
     f"{part}/{name}" for part, stem in WEIGHTS.items() for name in ("config.json", f"{stem}*.safetensors*")
@@ -85,46 +83,15 @@ def locate(model: str, appearance: bool = False) -> Path:
     """
     if model == "builtin":
         return builtin_folder(APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER)
-    folder = Path(model).expanduser()
-    if folder.is_dir():
-        return folder
-    if folder.exists():
-        raise UserError(f"{folder}: is a file; guidance.model takes a folder in Stable-Diffusion layout or a hub id")
-    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", model):
-        raise UserError(
-            f"{model}: no such folder; guidance.model is 'builtin', a pipeline folder or a hub id owner/name"
-        )
-    return _snapshot(model)
+    folder = local_folder(model, "guidance.model", "Stable-Diffusion layout")
+    return _snapshot(model) if folder is None else folder
 
 
 def _snapshot(model: str) -> Path:
-    from huggingface_hub import constants, snapshot_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
-    offline = constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on")
-    try:
-        folder = Path(
-            snapshot_download(
-                model,
-                allow_patterns=HUB_FILES,
-                ignore_patterns=["*.fp16.*", "*.non_ema.*", "*.bf16.*"],
-                local_files_only=offline,
-            )
-        )
-        if not offline and (folder / "model_index.json").is_file() and not _has_plain_weights(folder):
-            folder = Path(snapshot_download(model, allow_patterns=HUB_FILES, ignore_patterns=["*.non_ema.*"]))
-        return folder
-    except LocalEntryNotFoundError:
-        reason = "HF_HUB_OFFLINE is set and it is not in the cache" if offline else "not in the cache, no connection"
-        raise UserError(
-            f"{model}: neither a folder here nor a hub model that is at hand ({reason}); give a folder, or fetch the "
-            "model once while online"
-        ) from None
-    except Exception as error:  # the hub client raises many kinds: unknown id, gated, no network, disk full
-        raise UserError(
-            f"{model}: neither a folder here nor fetched from the hub ({first_line(error)}); check the id, or "
-            "give a folder"
-        ) from None
+    folder = hub_snapshot(model, HUB_FILES, ["*.fp16.*", "*.non_ema.*", "*.bf16.*"])
+    if not is_offline() and (folder / "model_index.json").is_file() and not _has_plain_weights(folder):
+        return hub_snapshot(model, HUB_FILES, ["*.non_ema.*"])
+    return folder
 
 
 def _has_plain_weights(folder: Path) -> bool:

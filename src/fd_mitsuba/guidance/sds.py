@@ -12,7 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-Weighting = Literal["sds", "uniform", "fantasia3d", "inverse"]
+from fd_mitsuba.conventions import Weighting
+
 PredictionType = Literal["epsilon", "v_prediction", "sample"]
 Annealing = Literal["linear", "sqrt"]
 

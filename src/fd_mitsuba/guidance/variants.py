@@ -16,6 +16,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from fd_mitsuba.conventions import Weighting
 from fd_mitsuba.guidance import sds
 
 Variant = Literal["sds", "csd", "ism", "reconstruction"]
@@ -26,7 +27,7 @@ class Distillation:
     """How the gradient is made in one phase; the names are those of the settings."""
 
     variant: Variant
-    weighting: sds.Weighting
+    weighting: Weighting
     guidance_scale: float
     image_guidance_scale: float
     timestep_range: tuple[float, float]
