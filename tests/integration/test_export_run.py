@@ -56,11 +56,13 @@ def test_what_cannot_be_exported_is_one_line(run_folder: Path, tmp_path: Path, c
 
     assert "no such run folder" in complaint(tmp_path / "nowhere")
     assert "not a run" in complaint(tmp_path)
-    scene = tmp_path / "scene.xml"
+    scene, copy = tmp_path / "scene.xml", run_folder / "scene" / "scene.xml"
     text = scene.read_text()
-    scene.write_text(text.replace('value="0.5"', 'value="0.6"'))
-    assert "was changed since the run" in complaint(run_folder)
-    scene.unlink()
+    for path in (scene, copy):
+        path.write_text(text.replace('value="0.5"', 'value="0.6"'))
+    assert "was changed, too; put the scene back" in complaint(run_folder)
+    for path in (scene, copy):
+        path.unlink()
     assert "the run's scene is gone" in complaint(run_folder)
     scene.write_text(text)
     settings = run_folder / "config.json"
@@ -71,3 +73,27 @@ def test_what_cannot_be_exported_is_one_line(run_folder: Path, tmp_path: Path, c
     for path in list_checkpoints(run_folder / "checkpoints"):
         path.unlink()
     assert "no checkpoint; run the geometry stage first" in complaint(run_folder)
+
+
+def test_a_run_folder_is_enough_for_an_export(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    """Moved away from its scene, which is gone: the same files, and a line that says what was read."""
+    assert main(["export", str(run_folder)]) == 0
+    names = [path for path in sorted((run_folder / "export").rglob("*")) if path.is_file()]
+    before = {path.relative_to(run_folder): path.read_bytes() for path in names}
+    moved = tmp_path / "far" / "away"
+    moved.parent.mkdir()
+    run_folder.rename(moved)
+    for name in ("scene.xml", "animal.ply"):
+        (tmp_path / name).unlink()
+    for name in ("glb", "obj", "ply", "mitsuba"):
+        (moved / "export" / before_name(name)).unlink()
+    capfd.readouterr()
+    assert main(["export", str(moved)]) == 0
+    said = capfd.readouterr().err
+    assert f"taking the copy of it in {moved / 'scene'}" in said
+    assert {name: (moved / name).read_bytes() for name in before} == before
+
+
+def before_name(kind: str) -> str:
+    names = {"glb": "asset.glb", "obj": "obj/asset.obj", "ply": "ply/part_part.ply", "mitsuba": "mitsuba/scene.xml"}
+    return names[kind]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import os
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.identity import changeable_settings, flat_settings
+from fd_mitsuba.config.sections import OutputConfig
 from fd_mitsuba.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -202,7 +203,7 @@ def test_bad_guidance_is_one_line(override: str, expected: str) -> None:
 
 
 def test_hash_follows_every_setting() -> None:
-    overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "output.sheet_every=3", "cameras.aim=object"]
+    overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "guidance.dtype=bfloat16", "cameras.aim=object"]
     hashes = [RunConfig.load(None, [override]).content_hash() for override in overrides]
     assert len({RunConfig().content_hash(), *hashes}) == len(overrides) + 1
     assert RunConfig.load(None, ["geometry.steps=3000"]).content_hash() == RunConfig().content_hash()
@@ -211,9 +212,73 @@ def test_hash_follows_every_setting() -> None:
 
 def test_runs_from_before_a_setting_was_there_can_be_read() -> None:
     """Their settings lack it, and so does what was hashed: the same hash now, another one where it does something."""
-    before = RunConfig().model_dump(mode="json", exclude={"texture", "appearance"})
-    del before["geometry"]["lambda_tether"], before["guidance"]["device"]
-    known = hashlib.sha256(json.dumps(before, sort_keys=True).encode()).hexdigest()[:16]
+    before = RunConfig().model_dump(mode="json")
+    del before["geometry"]["lambda_tether"]
     read = RunConfig.model_validate(before)
-    assert read.geometry.lambda_tether == 0 and read.content_hash() == RunConfig().content_hash() == known
-    assert RunConfig.load(None, ["geometry.lambda_tether=1"]).content_hash() != known
+    assert read.geometry.lambda_tether == 0 and "geometry.lambda_tether" not in read.identity()
+    assert RunConfig.load(None, ["geometry.lambda_tether=1"]).content_hash() != read.content_hash()
+
+
+def test_settings_that_may_change_on_the_way_are_marked_at_the_field() -> None:
+    marked = changeable_settings(RunConfig)
+    assert marked == {f"output.{name}" for name in OutputConfig.model_fields} | {
+        "guidance.views_per_call",
+        "guidance.device",
+    }
+    others = ["guidance.device=cuda:1", "guidance.views_per_call=1", *(f"{key}=17" for key in marked if "out" in key)]
+    for stage in ("geometry", "appearance"):
+        assert RunConfig.load(None, others).content_hash(stage) == RunConfig().content_hash(stage)
+    # Everything else counts, each setting by itself.
+    assert set(RunConfig().identity("appearance")) | marked | {"geometry.lambda_tether"} == set(
+        flat_settings(RunConfig().model_dump())
+    )
+
+
+def test_every_number_has_an_upper_bound() -> None:
+    """1e300 of a setting is refused, and the message says what is possible."""
+    for key, value in flat_settings(RunConfig().model_dump()).items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            continue
+        message = refusal(None, f"{key}=1e300")
+        assert key in message and "less than" in message, message
+    assert "appearance.exposure: Input should be less than" in refusal(None, "appearance.exposure=1e300")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("seed=" + "9" * 5000, "less than or equal to 2147483647"),
+        ("seed=" + "[" * 5000, "valid integer"),
+        ("seed" + ".a" * 5000 + "=1", "valid integer"),
+        ("a" * 5000 + "=1", "unknown key"),
+        ("appearance.spp=1000000000", "less than or equal to 4096"),
+        ("appearance={spp=4096, views=64, picture_size=4096}", "at most 4294967295"),
+        ("output={turntable_size=4096, turntable_frames=1000}", "at most 1000000000"),
+        ('guidance.model="a\\u0000b"', "guidance.model"),
+        ("geometry.focal_sigma_sdf=1e-300", "greater than or equal to"),
+        ("cameras.radius=1e-300", "greater than or equal to 0.5"),
+    ],
+)
+def test_extreme_values_are_refused_in_a_short_line(override: str, words: str) -> None:
+    message = refusal(None, override)
+    assert words in message and len(message) < 400
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("seed = " + "9" * 5000, "line 1: a number of 5000 digits"),
+        ("seed = " + "[" * 5000 + "]" * 5000, "nested too deep"),
+        ("# " + "x" * (1 << 20), "more than 1048576 bytes"),
+    ],
+)
+def test_a_file_that_the_parser_cannot_take(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    message = refusal(path)
+    assert message.startswith(str(path)) and words in message
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert "not a file" in refusal(tmp_path / "pipe.toml")

@@ -22,10 +22,22 @@ MODULES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Dotted names of all that the file imports, inside functions too; of `from a import b` both `a` and `a.b`."""
+    """Dotted names of all that the file imports, inside functions too; of `from a import b` both `a` and `a.b`.
+
+    What is imported for type checkers alone does not count.
+    """
     package = ("fd_mitsuba", *path.relative_to(ROOT).with_suffix("").parts)
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for_types = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
+        if node in for_types:
+            continue
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import struct
 from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
@@ -77,7 +78,7 @@ def loads(page: Page) -> list[str]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("runs") / "cat")
     (run / "export").mkdir()
-    (run / "export" / "asset.glb").write_bytes(b"glTF" + bytes(range(256)))
+    (run / "export" / "asset.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 268) + bytes(range(256)))
     (run / "evaluation.json").write_text(json.dumps({"clip": {"judge": "tiny", "sim": 0.31, "dir_dot": 0.05}}))
     write_report(run)
     return run

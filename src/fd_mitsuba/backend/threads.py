@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT, start
+from fd_mitsuba.errors import UserError
 
 _FEW_CORES = 2
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
@@ -39,9 +40,11 @@ def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
         variant: Mitsuba's variant.
 
     Raises:
-        UserError: as `startup.start`.
+        UserError: more threads than `most_threads`, and as `startup.start`.
     """
     global _cores
+    if threads > most_threads():
+        raise UserError(f"-t {threads}: give 0 (all cores) or at most {most_threads()}, more only hinder each other")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     cores = threads or available_cores()
     start(variant, threads if threads < 0 else renderer_threads(cores))
@@ -61,6 +64,21 @@ def share_cores_once() -> None:
 def available_cores() -> int:
     """Cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def most_threads() -> int:
+    """The largest number of threads that is taken: each has a stack of its own, and the system has a limit."""
+    return max(64, os.cpu_count() or 1)
+
+
+def cores_in_use() -> int:
+    """The cores given to `share_cores`; without that call the larger of the two pools."""
+    if _cores is not None:
+        return _cores
+    import drjit as dr
+    import torch
+
+    return max(dr.thread_count(), torch.get_num_threads())
 
 
 def renderer_threads(cores: int) -> int:

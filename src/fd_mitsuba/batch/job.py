@@ -14,7 +14,9 @@ from typing import BinaryIO
 
 from fd_mitsuba.config import RunConfig, settings_for_run
 from fd_mitsuba.config.toml_reading import locate_settings
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object
+from fd_mitsuba.scene.scene_copy import ELSEWHERE, copied_files
 
 PROGRAM = (sys.executable, "-m", "fd_mitsuba")
 FINISHED, SKIPPED, FAILED, INTERRUPTED, KILLED = "finished", "skipped", "failed", "interrupted", "killed"
@@ -108,7 +110,8 @@ def is_finished(job: Job) -> bool:
         read_json_object(job.folder / name) or {} for name in ("metrics.json", "run.json", "config.json")
     )
     stages = {"geometry"} if job.stage == "geometry" else {"geometry", "appearance"}
-    if not stages <= set(metrics.get("stages", ())):
+    said = metrics.get("stages")
+    if not isinstance(said, dict) or not stages <= set(said):
         return False
     try:
         before = RunConfig.model_validate(settings)
@@ -116,11 +119,13 @@ def is_finished(job: Job) -> bool:
         return False
     stage = "appearance" if "appearance" in stages else "geometry"
     parameters = dict(item.partition("=")[::2] for item in job.definitions)
+    now = job.settings()
     return (
-        before.content_hash(stage) == job.settings().content_hash(stage)
+        before.content_hash(stage) == now.content_hash(stage)
+        and before.output == now.output
         and known.get("parameters") == parameters
         and (job.prompt is None or known.get("prompt") == " ".join(job.prompt.split()))
-        and known.get("scene") == str(job.scene.resolve())
+        and _same_file(job.folder, known.get("scene"), job.scene)
         and _scene_is_unchanged(job)
     )
 
@@ -143,7 +148,8 @@ def perform(
     """
     if is_finished(job) and not attempts(job, token):
         metrics = read_json_object(job.folder / "metrics.json") or {}
-        return Outcome(job, SKIPPED, seconds=float(metrics.get("seconds", 0)))
+        seconds = metrics.get("seconds")
+        return Outcome(job, SKIPPED, seconds=float(seconds) if isinstance(seconds, int | float) else 0.0)
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with open(job.log, "ab") as log:
         if not _locked(log, stops):
@@ -211,14 +217,22 @@ def _last_words(log: Path, offset: int) -> str:
     return " ".join(spoken[-1].removeprefix("fd_mitsuba: error:").split())[:500] if spoken else ""
 
 
+def _same_file(folder: Path, recorded: object, scene: Path) -> bool:
+    return isinstance(recorded, str) and (folder.resolve() / recorded).resolve() == scene.resolve()
+
+
 def _scene_is_unchanged(job: Job) -> bool:
     """Every file that the run copied for the record is the one that the scene reads now."""
     record, root = job.folder / "scene", job.scene.resolve().parent
+    try:
+        names = {copy: root / name for name, copy in copied_files(record / job.scene.name).items()}
+    except UserError:
+        return False
+    own = record / ELSEWHERE
     for copy in record.rglob("*"):
-        if copy.is_file() and not copy.name.startswith("."):
-            place = copy.relative_to(record)
-            elsewhere = Path("/", *place.parts[1:])
-            origin = elsewhere if place.parts[0] == "elsewhere" and elsewhere.is_file() else root / place
-            if not origin.is_file() or origin.read_bytes() != copy.read_bytes():
-                return False
+        if not copy.is_file() or copy.name.startswith(".") or copy == own / "names.json":
+            continue
+        origin = names.get(copy.resolve(), root / copy.relative_to(record))
+        if not origin.is_file() or origin.read_bytes() != copy.read_bytes():
+            return False
     return record.is_dir()

@@ -99,7 +99,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     results = []
     for run in runs:
         try:
-            results.append(evaluate_run(run, judge, protocol, rivals, again))
+            results.append(evaluate_run(run, judge, protocol, rivals, again, remark))
         except UserError as error:
             if len(runs) == 1:
                 raise

@@ -84,7 +84,7 @@ def _render(options: argparse.Namespace) -> int:
     from fd_mitsuba.runs.appearance_outcome import render_run
 
     settings = (options.views, options.size, options.spp, options.depth)
-    for path in render_run(Path(options.run), definitions(options), options.output or "render", *settings):
+    for path in render_run(Path(options.run), definitions(options), options.output or "render", *settings, remark):
         print(path)
     return 0
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fd_mitsuba.cli.options import remark
+from fd_mitsuba.errors import UserError
+
 
 def add_report_commands(commands: argparse._SubParsersAction) -> None:
     """Put `report` beside the other commands."""
@@ -20,9 +23,16 @@ def _report(options: argparse.Namespace) -> int:
     from fd_mitsuba.evaluation.report.gallery import write_gallery
     from fd_mitsuba.evaluation.report.run_page import write_report
 
-    folders = [Path(run) for run in options.runs]
+    folders, failed = [Path(run) for run in options.runs], 0
     for folder in folders:
-        print(write_report(folder))
+        try:
+            print(write_report(folder))
+        except UserError as error:
+            if len(folders) == 1:
+                raise
+            failed += 1
+            remark(f"error: {error}")
     if options.gallery:
-        print(write_gallery(folders, Path(options.gallery), options.title))
-    return 0
+        # What cannot be shown was said above, and the page says it too.
+        print(write_gallery(folders, Path(options.gallery), options.title, lambda line: None))
+    return 1 if failed else 0

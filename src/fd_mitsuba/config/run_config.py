@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
+from fd_mitsuba.config.identity import identity_settings
 from fd_mitsuba.config.sections import (
     AppearanceConfig,
     CamerasConfig,
@@ -21,12 +22,10 @@ from fd_mitsuba.config.sections import (
     Section,
     TextureConfig,
 )
-from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml
+from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml, shortened
 from fd_mitsuba.errors import UserError
 
-_WITHOUT_EFFECT = {"guidance": ("device",)}
-"""Settings that change where the work is done and not what comes out."""
-_NEWER = {"geometry": {"lambda_tether": 0.0}}
+_NEWER = {"geometry.lambda_tether": 0.0}
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
 
@@ -80,19 +79,19 @@ class RunConfig(Section):
         except ValidationError as error:
             item = guilty_override(error, items)
             named = "--set" if source is None else "settings" if isinstance(source, Mapping) else source
-            place = f"--set {item}" if item is not None else named
+            place = f"--set {shortened(item)}" if item is not None else named
             raise UserError(f"{place}: {first_problem(error, cls)}") from None
 
+    def identity(self, stage: str = "geometry") -> dict[str, Any]:
+        """`section.key` -> value of what the stage depends on: its own settings and those of the stages before it.
+
+        Those marked with `MAY_CHANGE` are not among them.
+        """
+        later = frozenset({"texture", "appearance"}) if stage == "geometry" else frozenset()
+        values = identity_settings(self, later)
+        return {key: value for key, value in values.items() if _NEWER.get(key, ...) != value}
+
     def content_hash(self, stage: str = "geometry") -> str:
-        """Sixteen hex digits that change with any setting that the stage depends on, its own and those before it."""
-        later = {"texture", "appearance"} if stage == "geometry" else set()
-        values = self.model_dump(mode="json", exclude=later)
-        for section, names in _WITHOUT_EFFECT.items():
-            for name in names:
-                del values[section][name]
-        for section, neutral in _NEWER.items():
-            for name, value in neutral.items():
-                if values[section][name] == value:
-                    del values[section][name]
-        text = json.dumps(values, sort_keys=True)
+        """Sixteen hex digits that change with any setting in `identity`."""
+        text = json.dumps(self.identity(stage), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

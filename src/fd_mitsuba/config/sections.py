@@ -2,80 +2,115 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from fd_mitsuba.config.identity import MAY_CHANGE
 from fd_mitsuba.conventions import TextureChannel, Weighting
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Every number has an upper bound, far above what makes sense: what lies beyond ends in an overflow, in more memory
+# than there is or in a loop without end, hours later and in words that name no setting.
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, Field(ge=1)]
+Weight = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+GuidanceScale = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
+Length = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
+"""In canonical units, in which the base's longest side is 1.8."""
+Width = Annotated[float, Field(ge=1e-6, le=10, allow_inf_nan=False)]
+"""A length that is divided by."""
+Rate = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+Steps = Annotated[int, Field(ge=1, le=1_000_000)]
+Views = Annotated[int, Field(ge=1, le=64)]
+Samples = Annotated[int, Field(ge=1, le=4096)]
+"""Samples a pixel."""
+Points = Annotated[int, Field(ge=1, le=10_000_000)]
+Levels = Annotated[int, Field(ge=1, le=32)]
+Features = Annotated[int, Field(ge=1, le=16)]
+Neurons = Annotated[int, Field(ge=1, le=1024)]
+Cells = Annotated[int, Field(ge=1, le=1 << 20)]
+"""Cells a side of one level of a hash grid."""
 Range = tuple[float, float]
+MOST_SAMPLES = 2**32 - 1
+"""What Dr.Jit can number in one array."""
+MOST_TURNTABLE_PIXELS = 10**9
+"""All frames of a turntable are in memory at once, three bytes a pixel."""
 
 
 class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _large_counts_meet_their_bound(cls, data: Any) -> Any:
+        """Pydantic takes 1e300 for no whole number at all, and would not say which are possible."""
+        if not isinstance(data, dict):
+            return data
+        counts = {name for name, field in cls.model_fields.items() if field.annotation is int}
+        return {name: _whole(value) if name in counts else value for name, value in data.items()}
+
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and math.isfinite(value) and value.is_integer() else value
+
 
 class FieldConfig(Section):
     """The editable part's network: a hash grid and a two-layer MLP (paper, supplement "Geometry Learning")."""
 
-    levels: Count = 10
-    features: Count = 2
-    base_resolution: Count = 8
-    finest_resolution: Count = 128
+    levels: Levels = 10
+    features: Features = 2
+    base_resolution: Cells = 8
+    finest_resolution: Cells = 128
     log2_table: Annotated[int, Field(ge=4, le=24)] = 15
-    hidden: Count = 32
+    hidden: Neurons = 32
     offsets: bool = True
     """Let vertices of the tetrahedral grid move by up to half a cell, where the base's surface is not touched."""
 
 
 class GeometryConfig(Section):
-    steps: Count = 3000
+    steps: Steps = 3000
     coarse_fraction: Fraction = 2 / 3
     """Share of the steps in the coarse phase; the rest is the refined phase."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Rate = 1e-3
     betas: Range = (0.9, 0.99)
-    eps: Positive = 1e-15
-    weight_decay: NonNegative = 0.01
+    eps: Rate = 1e-15
+    weight_decay: Fraction = 0.01
     grid_resolution: Annotated[int, Field(ge=8, le=256)] = 64
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
-    union_k: NonNegative = 0.15
+    union_k: Length = 0.15
     union_only_outside: bool = False
-    lambda_sds: NonNegative = 1.0
-    lambda_focal: NonNegative = 1000.0
-    focal_sigma_distance: Positive = 0.05
-    focal_sigma_sdf: Positive = 0.01
-    focal_margin: NonNegative = 0.0
+    lambda_sds: Weight = 1.0
+    lambda_focal: Weight = 1000.0
+    focal_sigma_distance: Width = 0.05
+    focal_sigma_sdf: Width = 0.01
+    focal_margin: Length = 0.0
     """The paper's xi: also punishes an SDF that is negative by less than this."""
-    focal_band: NonNegative = 0.05
+    focal_band: Length = 0.05
     """Distance around the focal region, in canonical units, in which the part may overrun for free."""
-    focal_samples: Count = 10240
-    lambda_collision: NonNegative = 100.0
-    lambda_volume: NonNegative = 0.0
-    lambda_presence: NonNegative = 0.0
+    focal_samples: Points = 10240
+    lambda_collision: Weight = 100.0
+    lambda_volume: Weight = 0.0
+    lambda_presence: Weight = 0.0
     """Weight of the loss that leaves no focal region without a part; not in the paper."""
     presence_share: Annotated[float, Field(gt=0, le=1)] = 0.02
     """Share of each region, outside the base, that it keeps filled."""
-    lambda_tether: NonNegative = 0.0
+    lambda_tether: Weight = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
-    views: Count = 4
-    spp: Count = 4
-    silhouette_spp: Count = 1
+    views: Views = 4
+    spp: Samples = 4
+    silhouette_spp: Samples = 1
     normal_space: Literal["camera", "world"] = "camera"
 
 
 class TextureConfig(Section):
     """The part's texture field: a hash grid and an MLP with one hidden layer (supplement "PBR Material")."""
 
-    levels: Count = 12
-    features: Count = 2
-    base_resolution: Count = 16
-    finest_resolution: Count = 1024
+    levels: Levels = 12
+    features: Features = 2
+    base_resolution: Cells = 16
+    finest_resolution: Cells = 1024
     log2_table: Annotated[int, Field(ge=4, le=24)] = 16
-    hidden: Count = 32
+    hidden: Neurons = 32
     base_color_range: Range = (0.03, 0.94)
     """Above 0.94 a `principled` returns more light than it gets, since its highlight comes on top of the rest."""
     roughness_range: Range = (0.08, 1.0)
@@ -95,18 +130,18 @@ class TextureConfig(Section):
 
 
 class AppearanceConfig(Section):
-    steps: Count = 2000
-    learning_rate: Positive = 1e-2
+    steps: Steps = 2000
+    learning_rate: Rate = 1e-2
     betas: Range = (0.9, 0.99)
-    eps: Positive = 1e-15
-    weight_decay: NonNegative = 0.01
-    views: Count = 4
+    eps: Rate = 1e-15
+    weight_decay: Fraction = 0.01
+    views: Views = 4
     picture_size: Annotated[int, Field(ge=16, le=4096)] | None = None
     """Side of a rendered view in pixels; none: what the guidance model works with."""
-    spp: Count = 16
-    max_depth: Annotated[int, Field(ge=-1)] = 2
+    spp: Samples = 16
+    max_depth: Annotated[int, Field(ge=-1, le=1000)] = 2
     """As Mitsuba's `path`: 2 is direct light with shadows, more adds bounces, -1 does not end them."""
-    exposure: Positive | None = None
+    exposure: Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)] | None = None
     """Factor on linear colour before the sRGB curve; none: chosen once from the base as it is lit."""
     background: Literal["black", "white", "random", "light"] = "white"
     normal_map: bool = True
@@ -114,21 +149,21 @@ class AppearanceConfig(Section):
     """Channels that keep the values of the scene's part BSDF."""
     timestep_range: Range = (0.02, 0.98)
     weighting: Weighting = "inverse"
-    guidance_scale: NonNegative = 100.0
-    image_guidance_scale: NonNegative = 1.0
+    guidance_scale: GuidanceScale = 100.0
+    image_guidance_scale: GuidanceScale = 1.0
     mask_guidance: bool = True
     """Noise and gradient only where the part is seen."""
-    lambda_sds: NonNegative = 1.0
+    lambda_sds: Weight = 1.0
     style: bool = False
     """Style consistency with the base, for parts that continue its material; most edits do without."""
-    lambda_style: NonNegative = 10.0
-    lambda_boundary: NonNegative = 100.0
-    style_samples: Count = 2048
-    style_jitter: Positive = 0.01
+    lambda_style: Weight = 10.0
+    lambda_boundary: Weight = 100.0
+    style_samples: Points = 2048
+    style_jitter: Width = 0.01
     """Standard deviation of the paper's delta, canonical units."""
-    boundary_reach: Positive = 0.03
+    boundary_reach: Width = 0.03
     """The part's boundary is its surface within this distance of the base, canonical units."""
-    lambda_bend: NonNegative = 0.0
+    lambda_bend: Weight = 0.0
     """Price on bends of the shading normal, so that they are detail and not a lean of the whole part to the light."""
     single_path: bool = False
     """The paper's ablation: one field for the whole object, the base included."""
@@ -141,11 +176,17 @@ class AppearanceConfig(Section):
                 raise ValueError(f"{name} = ({first}, {last}) must be ordered and lie in [0, 1]")
         if self.max_depth in (0, 1):
             raise ValueError(f"max_depth = {self.max_depth} renders no light; use 2 or more, or -1")
+        samples = self.views * (self.picture_size or 32) ** 2 * self.spp
+        if samples > MOST_SAMPLES:
+            raise ValueError(
+                f"appearance.views x picture_size x picture_size x spp = {samples} samples a step, "
+                f"at most {MOST_SAMPLES} are possible"
+            )
         return self
 
 
 class GuidanceConfig(Section):
-    model: str = "builtin"
+    model: Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
     variant: Literal["sds", "csd", "ism", "reconstruction"] = "sds"
     """What makes the gradient; `guidance.variants` has the formulas."""
@@ -155,28 +196,28 @@ class GuidanceConfig(Section):
     """Distance between the two noise levels that `ism` compares, as a share of all timesteps."""
     ism_inversion_step: Annotated[float, Field(gt=0, le=1)] = 0.2
     """Stride of the DDIM inversion up to the lower of them; each stride is one pass of the network."""
-    guidance_scale: NonNegative = 100.0
+    guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
-    image_guidance_scale: NonNegative = 1.0
+    image_guidance_scale: GuidanceScale = 1.0
     weighting: Weighting = "sds"
     timestep_range_coarse: Range = (0.02, 0.35)
     timestep_range_refined: Range = (0.02, 0.35)
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
     """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
     normalise_gradient: bool = False
-    views_per_call: Count = 4
+    views_per_call: Annotated[Views, MAY_CHANGE] = 4
     """Pictures sent through the UNet at once; fewer need less memory."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
-    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d+)?)$")] = "cpu"
+    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d{1,3})?)$"), MAY_CHANGE] = "cpu"
     """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
 
 
 class CamerasConfig(Section):
-    radius: Positive = 3.0
+    radius: Annotated[float, Field(ge=0.5, le=100, allow_inf_nan=False)] = 3.0
     elevation_deg: Range = (-10.0, 45.0)
     fov_deg: Range = (38.0, 45.0)
-    centre_jitter: NonNegative = 0.0
+    centre_jitter: Length = 0.0
     aim: Literal["origin", "object"] = "origin"
     """What the cameras look at: the base's centre, or the centre of base and focal regions together."""
     focus_fraction: Fraction = 0.0
@@ -184,10 +225,22 @@ class CamerasConfig(Section):
 
 
 class OutputConfig(Section):
-    sheet_every: Annotated[int, Field(ge=0)] = 250
-    checkpoint_every: Count = 100
-    checkpoints_kept: Count = 2
-    turntable_frames: Count = 48
-    turntable_size: Annotated[int, Field(ge=16)] = 256
-    texture_size: Annotated[int, Field(ge=16, le=8192)] = 1024
+    """What is written, how often and how large; nothing of it changes the part."""
+
+    sheet_every: Annotated[int, Field(ge=0, le=1_000_000), MAY_CHANGE] = 250
+    checkpoint_every: Annotated[Steps, MAY_CHANGE] = 100
+    checkpoints_kept: Annotated[Steps, MAY_CHANGE] = 2
+    turntable_frames: Annotated[int, Field(ge=1, le=1000), MAY_CHANGE] = 48
+    turntable_size: Annotated[int, Field(ge=16, le=4096), MAY_CHANGE] = 256
+    texture_size: Annotated[int, Field(ge=16, le=8192), MAY_CHANGE] = 1024
     """Texels a side of each exported part's pictures."""
+
+    @model_validator(mode="after")
+    def _turntable_fits(self) -> OutputConfig:
+        pixels = self.turntable_frames * self.turntable_size**2
+        if pixels > MOST_TURNTABLE_PIXELS:
+            raise ValueError(
+                f"output.turntable_frames x turntable_size x turntable_size = {pixels} pixels, at most "
+                f"{MOST_TURNTABLE_PIXELS} are possible"
+            )
+        return self

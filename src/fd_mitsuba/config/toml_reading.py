@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,11 @@ from pydantic import BaseModel, ValidationError
 from fd_mitsuba.errors import UserError
 
 PRESETS_FOLDER = Path(__file__).with_name("presets")
+_MOST_BYTES = 1 << 20
+_TOO_LONG = re.compile(r"[0-9]{4000,}")
+"""A whole number that Python does not read, or nearly so."""
+_MOST_SHOWN = 60
+"""Characters of a wrong value that a message repeats."""
 
 
 def preset_names() -> list[str]:
@@ -30,11 +36,20 @@ def read_toml(source: str | Path) -> dict[str, Any]:
     """The content of a TOML file or of shipped settings.
 
     Raises:
-        UserError: no such file or name, unreadable, not TOML.
+        UserError: no such file or name, not a plain file, too large, unreadable, not TOML, nested too deep.
     """
     path = locate_settings(source)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        # A pipe or a device would be read for ever.
+        if path.exists() and not path.is_file():
+            raise UserError(f"{source}: cannot be read (not a file); give a readable TOML file")
+        if path.is_file() and path.stat().st_size > _MOST_BYTES:
+            raise UserError(f"{source}: cannot be read (more than {_MOST_BYTES} bytes); give a TOML file of settings")
+        text = path.read_text(encoding="utf-8")
+        if number := _TOO_LONG.search(text):
+            line = text.count("\n", 0, number.start()) + 1
+            raise UserError(f"{source}: line {line}: a number of {len(number[0])} digits; shorten it")
+        return tomllib.loads(text)
     except FileNotFoundError:
         known = ", ".join(preset_names())
         raise UserError(f"{source}: no such config file; give one of {known}, or the path of a TOML file") from None
@@ -42,6 +57,8 @@ def read_toml(source: str | Path) -> dict[str, Any]:
         raise UserError(f"{source}: cannot be read ({error}); give a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{source}: not valid TOML ({error}); mend that line") from None
+    except RecursionError:
+        raise UserError(f"{source}: not valid settings (nested too deep); sections hold plain values") from None
 
 
 def apply_override(data: dict[str, Any], item: str) -> str:
@@ -49,17 +66,18 @@ def apply_override(data: dict[str, Any], item: str) -> str:
     key, separator, text = item.partition("=")
     key, text = key.strip(), text.strip()
     if not separator or not key:
-        raise UserError(f"--set {item}: write section.key=value, as in --set geometry.steps=200")
+        raise UserError(f"--set {shortened(item)}: write section.key=value, as in --set geometry.steps=200")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text
+    except (ValueError, RecursionError):  # not TOML, a number of thousands of digits, brackets without end
+        # A number that long is beyond every bound, and so is its beginning.
+        value = int(text[:4000]) if _TOO_LONG.fullmatch(text) else text
     *sections, name = [part.strip() for part in key.split(".")]
     target = data
     for section in sections:
         target = target.setdefault(section, {})
         if not isinstance(target, dict):
-            raise UserError(f"--set {item}: {section!r} is a value, not a section")
+            raise UserError(f"--set {shortened(item)}: {section!r} is a value, not a section")
     target[name] = value
     return ".".join([*sections, name])
 
@@ -85,8 +103,20 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
         known = _known_keys(model) if "." in key else list(model.model_fields)
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.4)
         hint = f"nearest: {', '.join(near)}" if near else f"sections: {', '.join(model.model_fields)}"
-        return f"unknown key {key!r}; {hint}"
-    return f"{key + ': ' if key else ''}{problem['msg']} (given: {str(problem['input'])[:60]!r}); change the value"
+        return f"unknown key {shortened(key)!r}; {hint}"
+    return f"{key + ': ' if key else ''}{problem['msg']} (given: {_given(problem['input'])}); change the value"
+
+
+def _given(value: object) -> str:
+    try:
+        return repr(shortened(str(value)))
+    except (ValueError, RecursionError):  # more digits than Python writes, tables without end
+        return "too long to be shown"
+
+
+def shortened(text: str) -> str:
+    """The text, or its beginning where it is long."""
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
 def _known_keys(model: type[BaseModel]) -> list[str]:

@@ -170,9 +170,9 @@ def ablate(
         for job in mine:
             say(f"evaluating {job.name} of {scene_name(job.scene)}")
             if row.stage != "appearance":  # there the shape is the full method's
-                shape.append(evaluate_run(job.folder, judge, _of_shape(protocol), rivals))
+                shape.append(evaluate_run(job.folder, judge, _of_shape(protocol), rivals, say=say))
             if job.stage == "all":
-                lit.append(evaluate_run(job.folder, judge, protocol, rivals))
+                lit.append(evaluate_run(job.folder, judge, protocol, rivals, say=say))
         results.append(RowResult(row, tuple(job.folder for job in mine), tuple(lit), tuple(shape)))
     return results
 

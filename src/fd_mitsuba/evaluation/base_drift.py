@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.judged_views import JudgedViews
 from fd_mitsuba.evaluation.picture_difference import psnr, ssim
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.scene.mesh_source import shape_triangles
+from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile, file_threads, ready_mitsuba
 
 _SURFACE_POINTS = 20_000
@@ -95,7 +96,12 @@ def _exported_base(scene: EditScene, exported: Path, copies: dict[Path, Path | N
             path, plugin, properties, to_world = exported / f"{mesh.name}.ply", "ply", {}, np.eye(4)
         if path is None or not path.is_file():
             return None
-        points, triangles = shape_triangles(ready_mitsuba(), plugin, {**properties, "filename": str(path)}, to_world)
+        try:
+            points, triangles = shape_triangles(
+                ready_mitsuba(), plugin, {**properties, "filename": str(path)}, to_world
+            )
+        except (BrokenMesh, NotAMesh, RuntimeError) as error:
+            raise UserError(f"{path}: is damaged ({error}); export the run anew") from None
         vertices.append(points)
         faces.append(triangles + first)
         first += len(points)
@@ -124,7 +130,10 @@ def _difference(source: Path, copy: Path) -> float:
         return 0.0
     mi = ready_mitsuba()
     with file_threads():
-        before, after = (np.array(mi.Bitmap(str(path))) for path in (source, copy))
+        try:
+            before, after = (np.array(mi.Bitmap(str(path))) for path in (source, copy))
+        except RuntimeError:  # an image that cannot be read any more is another one
+            return 1.0
     if before.shape != after.shape:
         return 1.0
     whole = np.iinfo(before.dtype).max if before.dtype.kind == "u" else 1.0

@@ -14,8 +14,9 @@ from fd_mitsuba.export.part_record import part_file
 def check_parts(names: Iterable[str], folder: Path, scale: float) -> dict[str, dict]:
     """Name -> figures of `folder/export/part_<name>.ply`.
 
-    `lost`: there is no file or nothing in it. `faces`; `closed`: every edge has two faces, of one winding; `pieces`:
-    connected components; `volume`: enclosed, canonical units cubed. `valid`: not lost, closed, with a volume.
+    `lost`: there is no file, or none that can be read, or nothing in it. `faces`; `closed`: every edge has two faces,
+    of one winding; `pieces`: connected components; `volume`: enclosed, canonical units cubed. `valid`: not lost,
+    closed, with a volume.
 
     Args:
         scale: canonical units in one unit of the user's frame.
@@ -24,7 +25,10 @@ def check_parts(names: Iterable[str], folder: Path, scale: float) -> dict[str, d
 
 
 def _check(path: Path, scale: float) -> dict:
-    mesh = trimesh.load(path, process=False) if path.is_file() else None
+    try:
+        mesh = trimesh.load(path, process=False) if path.is_file() else None
+    except Exception:  # of a damaged file, whatever its reader says of it
+        mesh = None
     if mesh is None or not len(getattr(mesh, "faces", ())):
         return {"lost": True, "valid": False, "faces": 0, "closed": False, "pieces": 0, "volume": 0.0}
     mesh.merge_vertices()

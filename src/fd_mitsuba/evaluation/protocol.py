@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.base_drift import export_drift, picture_drift
 from fd_mitsuba.evaluation.front_in_back import front_in_back
 from fd_mitsuba.evaluation.judged_views import ELEVATION_DEG, JudgedViews
@@ -14,9 +14,15 @@ from fd_mitsuba.evaluation.part_check import check_parts
 from fd_mitsuba.evaluation.scene_prompts import other_parts
 from fd_mitsuba.evaluation.similarity import EditPrompt, Judge, clip_scores, retrieval
 from fd_mitsuba.guidance.vocabulary import Vocabulary
+from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.scene.edit_scene import EditScene
 
 FORMAT = 3
+_MEASURED = (
+    *("base_identical", "inside_fraction", "overlap_fraction", "part_volume", "manifold", "islands_removed", "gap"),
+    "seconds",
+)
+"""What `metrics.json` has of every run."""
 
 
 def judged(
@@ -62,7 +68,12 @@ def judged(
 
 def measured(scene: EditScene, folder: Path, views: JudgedViews) -> dict:
     """What needs no judge: base, part, locality, cost; the last two as the run itself has measured them."""
-    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    metrics = read_json_object(folder / "metrics.json") or {}
+    missing = [name for name in _MEASURED if name not in metrics]
+    numbers = [metrics.get(name) for name in ("inside_fraction", "overlap_fraction", "seconds")]
+    if missing or not all(isinstance(number, int | float) for number in numbers):
+        what = f"no {missing[0]}" if missing else "a metric is no number"
+        raise UserError(f"{folder / 'metrics.json'}: is damaged ({what}); go on with the run by --resume")
     return {
         "base": {
             "identical": metrics["base_identical"],

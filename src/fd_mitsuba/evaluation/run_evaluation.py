@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +17,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.boundary_step import boundary_step
 from fd_mitsuba.evaluation.judged_views import JudgedViews, lit_views, shape_views
 from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
+from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
 from fd_mitsuba.evaluation.similarity import EditPrompt, Judge
 from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
@@ -61,6 +62,7 @@ def evaluate_run(
     protocol: Protocol | None = None,
     rivals: Sequence[ScenePrompts] = (),
     again: bool = False,
+    say: Callable[[str], None] = print,
 ) -> dict:
     """The figures of one run, which are also written to `folder/evaluation.json`, or `evaluation_shape.json` where
     pictures of the bare shape were asked for; views are shown in `folder/images` under the same name.
@@ -68,6 +70,7 @@ def evaluate_run(
     Args:
         rivals: the scenes whose edit prompts the run's own has to be found among. If the built-in models know every
             word of the run's prompt, only the scenes of which that is true count.
+        say: takes a line where the run's scene is gone and its copy is read.
         again: also if a result of the same run, judge, protocol and rivals is there already.
 
     Raises:
@@ -79,9 +82,9 @@ def evaluate_run(
     path = folder / (RESULT_NAME if protocol.pictures != "shape" else "evaluation_shape.json")
     key = _key(folder, judge, protocol, rivals)
     known = read_json_object(path) or {}
-    if not again and known.get("key") == key:
+    if not again and known.get("key") == key and _is_whole(known):
         return known
-    scene, config = saved_run(folder)
+    scene, config = saved_run(folder, say=say)
     appearance = None if protocol.pictures == "shape" else finished_appearance(scene, config, folder)
     if appearance is None and protocol.pictures == "lit":
         raise UserError(f"{folder}: its appearance stage has not begun; evaluate its shape instead")
@@ -100,7 +103,7 @@ def evaluate_run(
         "format": FORMAT,
         "key": key,
         "run": str(folder),
-        "scene": scene.path.resolve().parent.name,
+        "scene": (read_json_object(folder / "run.json") or {}).get("scene_name") or scene.path.resolve().parent.name,
         "prompt": own.prompt,
         "base_prompt": own.base_prompt,
         "seed": config.seed,
@@ -137,6 +140,16 @@ def vocabulary_of(model: str) -> Vocabulary | None:
     """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion."""
     folder = BUILTIN_FOLDER if model == "builtin" else Path(model)
     return read_model_conventions(folder).vocabulary if folder.is_dir() else None
+
+
+def _is_whole(known: dict) -> bool:
+    """Whether a result that was read again has all that tables ask for."""
+    texts = all(isinstance(known.get(name), str) for name in ("scene", "prompt", "judge")) and "seed" in known
+    groups = all(isinstance(known.get(name), dict) for name in ("views", "clip", "part", "base", "cost"))
+    try:
+        return texts and groups and "kind" in known["views"] and bool([c.value(known) for c in COLUMNS.values()])
+    except (TypeError, ValueError, KeyError, AttributeError):
+        return False
 
 
 def _shape_kind(judge: Judge) -> Literal["normals", "shaded"]:

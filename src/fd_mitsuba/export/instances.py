@@ -16,6 +16,8 @@ from __future__ import annotations
 import copy
 import json
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instance_glb import instance_glb
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.json_object import read_json_object
 
 _KEYS = {"part", "to_world", "position", "direction", "twist_deg", "scale", "base"}
 MOST_PLACEMENTS = 100_000
@@ -51,21 +54,52 @@ def write_instances(run: Path, transforms: Path, name: str) -> list[Path]:
     """
     folder = run / "export"
     scene = folder / "mitsuba" / "scene.xml"
-    try:
-        record = json.loads((folder / "part.json").read_text(encoding="utf-8"))
-        exported = scene.read_bytes()
-    except (OSError, ValueError):
-        raise UserError(f"{scene}: not there, or without part.json; run fd_mitsuba export {run} first") from None
+    record = read_json_object(folder / "part.json")
+    if record is None or not scene.is_file():
+        raise UserError(f"{scene}: missing, or without part.json; run fd_mitsuba export {run} first")
+    _check_record(folder / "part.json", record)
+    exported = scene.read_bytes()
     if Path(name).name != name or name in (scene.name, "asset.xml") or not name.endswith(".xml"):
         raise UserError(f"-o {name}: give a plain file name such as instances.xml; it is written beside {scene}")
     placements = read_placements(transforms, record)
-    made = {scene.with_name(name): instance_scene(exported, placements)}
+    with _whole(scene, run):
+        made = {scene.with_name(name): instance_scene(exported, placements)}
     asset = folder / "asset.glb"
     if asset.is_file():
-        made[folder / Path(name).with_suffix(".glb")] = instance_glb(asset.read_bytes(), placements)
+        with _whole(asset, run):
+            made[folder / Path(name).with_suffix(".glb")] = instance_glb(asset.read_bytes(), placements)
     for path, data in made.items():
         write_atomically(path, data)
     return list(made)
+
+
+@contextmanager
+def _whole(path: Path, run: Path) -> Iterator[None]:
+    """Around the use of an exported file: whatever a damaged one does to its parser becomes one line about the file."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        about = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UserError(f"{path}: is damaged ({about}); run fd_mitsuba export {run} anew") from None
+
+
+def _check_record(path: Path, record: dict[str, Any]) -> None:
+    parts = record.get("parts")
+    held = list(parts.values()) if isinstance(parts, dict) else []
+    anchors = [part.get("anchor") if isinstance(part, dict) else None for part in held]
+    numbers = [
+        anchor.get(name) if isinstance(anchor, dict) else None
+        for anchor in anchors
+        for name in ("position", "direction")
+    ]
+    if not held or not all(map(_is_vector, numbers)):
+        raise UserError(f"{path}: is damaged (no parts with their anchors); export the run anew")
+
+
+def _is_vector(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(isinstance(number, int | float) for number in value)
 
 
 def read_placements(path: Path, record: dict[str, Any]) -> list[Placement]:
@@ -78,9 +112,13 @@ def read_placements(path: Path, record: dict[str, Any]) -> list[Placement]:
         UserError: an unreadable file, or an entry that does not say where which part goes.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path}: cannot be read (not a file); give a JSON list of placements")
         entries = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give a JSON list of placements") from None
+    except RecursionError:
+        raise UserError(f"{path}: not a list of placements (nested too deep); write [{{...}}, ...]") from None
     except ValueError as error:
         raise UserError(f"{path}: not valid JSON ({error}); mend that line") from None
     if not isinstance(entries, list) or not entries or len(entries) > MOST_PLACEMENTS:
@@ -179,7 +217,7 @@ def _placement(where: str, entry: Any, record: dict[str, Any]) -> Placement:
 def _numbers(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.shape != shape or not np.all(np.isfinite(array)):
         wanted = "a finite number" if not shape else f"{' x '.join(map(str, shape))} finite numbers"

@@ -92,7 +92,8 @@ def require_memory(needed_weights: int, working_set: int, device: str, source: s
         raise UserError(
             f"{source}: needs about {_gigabytes(needed)} ({_gigabytes(needed_weights)} of weights, "
             f"{_gigabytes(working_set)} to work in) but {device} has {_gigabytes(available)} left; lower "
-            "guidance.views_per_call, set guidance.dtype to bfloat16, or take a smaller model such as builtin"
+            "guidance.views_per_call, which --resume accepts too, or start anew with guidance.dtype=bfloat16 or a "
+            "smaller model such as builtin"
         )
 
 

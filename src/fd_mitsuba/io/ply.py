@@ -1,8 +1,19 @@
-"""PLY files."""
+"""PLY files of triangles, as this package writes them, and read back with care."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
+
+from fd_mitsuba.errors import UserError
+
+_FACE = np.dtype([("count", "u1"), ("index", "<i4", 3)])
+_OWN_HEADER = re.compile(
+    rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d{1,10})\nproperty float x\nproperty float y\n"
+    rb"property float z\nelement face (\d{1,10})\nproperty list uchar int vertex_indices\nend_header\n"
+)
 
 
 def ply_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
@@ -12,6 +23,32 @@ def ply_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    rows = np.empty(len(faces), dtype=_FACE)
     rows["count"], rows["index"] = 3, faces
     return header.encode("ascii") + np.ascontiguousarray(vertices, "<f4").tobytes() + rows.tobytes()
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and faces (F, 3) int64 of a PLY that `ply_bytes` has made, checked.
+
+    Raises:
+        UserError: a file that is not as it was written: cut short, NaN, an index out of range.
+    """
+    damaged = UserError(f"{path}: is damaged or not from this run; run the geometry stage again (--resume)")
+    try:
+        data = path.read_bytes()
+    except OSError:
+        raise damaged from None
+    found = _OWN_HEADER.match(data)
+    if found is None:
+        raise damaged
+    start, points, triangles = found.end(), int(found[1]), int(found[2])
+    if len(data) != start + 12 * points + 13 * triangles:
+        raise damaged
+    vertices = np.frombuffer(data, "<f4", 3 * points, start).reshape(-1, 3).astype(np.float64)
+    rows = np.frombuffer(data, _FACE, triangles, start + 12 * points)
+    faces = rows["index"].astype(np.int64).reshape(-1, 3)
+    in_range = not len(faces) or (faces.min() >= 0 and faces.max() < points)
+    if not in_range or (rows["count"] != 3).any() or not np.isfinite(vertices).all():
+        raise damaged
+    return vertices, faces

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -13,10 +12,12 @@ from PIL import Image
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.io.picture import write_picture
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
@@ -25,10 +26,8 @@ from fd_mitsuba.runs.preservation import measure_preservation
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.mesh_source import shape_triangles
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.region_mode import cut_faces_name
-from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
@@ -58,7 +57,9 @@ def parts_of_run(scene: EditScene, folder: Path) -> dict[str, TriangleMesh]:
         path = folder / "export" / (f"{cut_faces_name(name)}.ply" if scene.subtracts else part_file(name))
         if not path.is_file():
             raise UserError(f"{path}: missing; run the geometry stage first (--stage geometry)")
-        vertices, faces = _triangles(path)
+        vertices, faces = read_ply(path)
+        if not len(faces):
+            raise UserError(f"{path}: is empty; run the geometry stage again (--resume)")
         parts[name] = TriangleMesh(name, scene.frame.to_canonical(vertices), faces, (path,))
     return parts
 
@@ -73,11 +74,14 @@ def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None
     if not scene.subtracts:
         return None
     record = folder / "export" / "part.json"
-    try:
-        names = json.loads(record.read_text(encoding="utf-8"))["opened"]
-        opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
-    except (OSError, ValueError, KeyError):
-        raise UserError(f"{record}: does not say what is left of the base; run the geometry stage anew") from None
+    names = (read_json_object(record) or {}).get("opened")
+    plain = isinstance(names, dict) and all(
+        number.isdecimal() and (name is None or (isinstance(name, str) and Path(name).name == name))
+        for number, name in names.items()
+    )
+    if not plain:
+        raise UserError(f"{record}: does not say what is left of the base; run the geometry stage anew")
+    opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
     for path in opened.values():
         if path is not None and not path.is_file():
             raise UserError(f"{path}: missing; run the geometry stage anew (--stage geometry)")
@@ -87,11 +91,7 @@ def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None
 def _removed(scene: EditScene, folder: Path) -> list[np.ndarray] | None:
     """Vertices (V, 3) of what was cut out, user frame; None for scenes that do not cut."""
     paths = [folder / "export" / part_file(name) for name in scene.parts]
-    return [_triangles(path)[0] for path in paths if path.is_file()] if scene.subtracts else None
-
-
-def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    return shape_triangles(ready_mitsuba(), "ply", {"filename": str(path)}, np.eye(4))
+    return [read_ply(path)[0] for path in paths if path.is_file()] if scene.subtracts else None
 
 
 def prepare_appearance(
@@ -195,7 +195,14 @@ def lit_turntable(stage: AppearanceStage, count: int, size: int, spp: int) -> np
 
 
 def render_run(
-    folder: Path, changed: dict[str, str], name: str, views: int, size: int, spp: int, max_depth: int
+    folder: Path,
+    changed: dict[str, str],
+    name: str,
+    views: int,
+    size: int,
+    spp: int,
+    max_depth: int,
+    say: Callable[[str], None] = print,
 ) -> list[Path]:
     """Render a run's object all around, with other values for the scene's `$name`, such as another light.
 
@@ -209,7 +216,7 @@ def render_run(
         raise UserError(f"--views {views} --size {size} --spp {spp} --depth {max_depth}: too small; raise it")
     if Path(name).name != name:
         raise UserError(f"--output {name}: give a name without folders; pictures go to {folder / 'renders'}")
-    scene, config = saved_run(folder, changed)
+    scene, config = saved_run(folder, changed, say)
     stage = finished_appearance(scene, config, folder, max_depth)
     if stage is None:
         raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")

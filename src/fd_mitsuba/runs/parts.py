@@ -12,6 +12,7 @@ from fd_mitsuba.export.assets import FORMATS
 from fd_mitsuba.export.mitsuba_xml import FILES
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.runs.pipeline import export_run
+from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.scene.part_stack import HIDDEN, RECORD_NAME, REMOVED, SHOWN, StackedPart, read_stack, stack_bytes
 
 _WRITTEN = {"glb": "asset.glb", "obj": "obj/asset.obj", "ply": "ply", "mitsuba": "mitsuba/scene.xml"}
@@ -45,6 +46,14 @@ def change_parts(
     Raises:
         UserError: an unknown name, or one that is given twice; the last part shown; see `export_run`.
     """
+    _stack(run)  # where there is no such run, no folder is to be made
+    with run_lock(run, say):
+        return _change_parts(run, hide, show, remove, say)
+
+
+def _change_parts(
+    run: Path, hide: Sequence[str], show: Sequence[str], remove: Sequence[str], say: Callable[[str], None]
+) -> tuple[StackedPart, ...]:
     stack, settings = _stack(run)
     names = [*hide, *show, *remove]
     known = [part.name for part in stack if part.state != REMOVED]

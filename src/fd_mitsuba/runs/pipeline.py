@@ -37,7 +37,8 @@ from fd_mitsuba.runs.geometry_outcome import (
     take_geometry,
 )
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
-from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint
+from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
+from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.training.appearance_stage import AppearanceStage
@@ -78,6 +79,24 @@ def run(
         UserError, RunStopped, Interrupted: see `training.loop.run_stage`. A run that ends with an error before its
             first checkpoint leaves no folder behind.
     """
+    refuse_strange_folder(folder)
+    with run_lock(folder, say):
+        return _run(scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step)
+
+
+def _run(
+    scene: EditScene,
+    config: RunConfig,
+    folder: Path,
+    resume: bool,
+    command: str,
+    quiet: bool,
+    say: Callable[[str], None],
+    stages: Collection[str],
+    geometry_from: Path | None,
+    guidance: Guidance | None,
+    on_step: OnStep | None,
+) -> dict:
     started = time.monotonic()
     asked, with_assets = stages, "appearance" in stages
     if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
@@ -86,7 +105,8 @@ def run(
         say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
         stages = ("geometry",)
     with_geometry = "geometry" in stages and geometry_from is None
-    check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None))
+    for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
+        say(line)
     # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
     for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None
     for_appearance = None
@@ -102,12 +122,14 @@ def run(
             describe_run(scene, config, folder, command)
             run_stage(geometry, folder, resume, quiet, say, on_step)
     elif geometry_from is not None:
-        refuse_other_shape(saved_run(geometry_from)[0], scene, geometry_from)
+        refuse_other_shape(saved_run(geometry_from, say=say)[0], scene, geometry_from)
         geometry = load_finished_stage(scene, config, geometry_from)
-        describe_run(scene, config, folder, command)
-        take_geometry(geometry_from, folder)
+        with discarded_without_checkpoint(folder):
+            describe_run(scene, config, folder, command)
+            take_geometry(geometry_from, folder)
     else:
         geometry = load_finished_stage(scene, config, folder)
+        describe_run(scene, config, folder, command)
     with rendering_threads():
         metrics = export_geometry(geometry, folder)
     if guidance is not None:
@@ -156,11 +178,12 @@ def export_run(
     """
     if faces is not None and faces < LEAST_FACES:
         raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
-    scene, config = saved_run(folder)
-    geometry = load_finished_stage(scene, config, folder)
-    appearance = finished_appearance(scene, config, folder)
-    field = None if appearance is None else appearance.field
-    return write_assets(geometry, field, folder, formats, texture_size, say, faces)
+    scene, config = saved_run(folder, say=say)
+    with run_lock(folder, say):
+        geometry = load_finished_stage(scene, config, folder)
+        appearance = finished_appearance(scene, config, folder)
+        field = None if appearance is None else appearance.field
+        return write_assets(geometry, field, folder, formats, texture_size, say, faces)
 
 
 def write_assets(

@@ -199,11 +199,13 @@ def _to_world(element: SceneElement) -> np.ndarray:
 def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> tuple[np.ndarray, np.ndarray]:
     to_world = _to_world(element)
     plain = {name: value for name, value in element.properties.items() if name != "to_world"}
+    if filename:
+        plain["filename"] = str(file.resolve(filename))
     subject = f"{filename}: " if filename else ""
     try:
         with file.searching():
             if element.plugin == FOCAL_REGION:
-                return region_triangles(file.mi, filename, to_world)
+                return region_triangles(file.mi, plain.get("filename"), to_world)
             return shape_triangles(file.mi, element.plugin, plain, to_world)
     except NotAMesh:
         raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None

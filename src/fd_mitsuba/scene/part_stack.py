@@ -102,8 +102,8 @@ def read_stack(folder: Path) -> tuple[tuple[StackedPart, ...], dict[str, Any]]:
         names = {field.name for field in fields(StackedPart)}
         entries = [{key: value for key, value in entry.items() if key in names} for entry in record["parts"]]
         parts = tuple(_entry(entry) for entry in entries)
-        return parts, dict(record.get("export", {}))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return parts, _export_settings(record.get("export", {}))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         raise UserError(
             f"{path}: is damaged; export the run anew, or delete it (prompts and rounds are lost)"
         ) from None
@@ -115,10 +115,20 @@ def stack_bytes(parts: Iterable[StackedPart], export: dict[str, Any]) -> bytes:
     return (json.dumps(record, indent=2) + "\n").encode()
 
 
+def _export_settings(values: dict[str, Any]) -> dict[str, Any]:
+    for name, usual in (("texture_size", 1024), ("faces", None)):
+        value = values.get(name, usual)
+        if isinstance(value, bool) or not (isinstance(value, int) or value is usual):
+            raise ValueError(f"{name} is no number")
+    return dict(values)
+
+
 def _entry(values: dict[str, Any]) -> StackedPart:
     part = StackedPart(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
     if not all(isinstance(value, str) for value in (part.name, part.prompt, part.file, part.normal, *part.pictures)):
         raise ValueError("not text")
+    if Path(part.shape).name != part.shape:  # it becomes part of a file's name
+        raise ValueError("not a name")
     if not isinstance(part.round, int) or len([float(value) for value in part.factor]) != 3:
         raise ValueError("not a number")
     return part

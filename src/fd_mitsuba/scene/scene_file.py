@@ -13,6 +13,7 @@ from fd_mitsuba.backend import startup
 from fd_mitsuba.backend.parser_message import one_line
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.plugins import register
+from fd_mitsuba.scene.scene_copy import copied_files
 from fd_mitsuba.scene.xml_guard import refuse_plugin_path, scan_scene
 
 MAX_OBJECT_NESTING = 16
@@ -98,6 +99,7 @@ class SceneFile:
         self.parameters = dict(parameters or {})
         self.text = scan_scene(self.path, self.parameters)
         self.mi = ready_mitsuba()
+        self._copied = copied_files(self.path)
         self._described: dict[tuple[int, int], str] = {}
         self._resolver = self._own_resolver()
         with self.searching():
@@ -124,6 +126,7 @@ class SceneFile:
             state = self._parse()
             if without:
                 self._drop(state, without)
+            self._find_copies(state)
             try:
                 with file_threads():
                     scene = self.mi.parser.instantiate(self._config(), state)
@@ -254,12 +257,19 @@ class SceneFile:
             name = element.properties.get("filename")
             if not isinstance(name, str):
                 continue
-            target = Path(str(resolver.resolve(name)))
+            target = self._copied.get(name) or Path(str(resolver.resolve(name)))
             if not target.is_file():
                 kind = "is a folder" if target.is_dir() else f"not found (looked in {self.path.parent})"
                 raise element.error(f"file {name!r} {kind}; correct the file name")
             files[name] = target
         return files
+
+    def _find_copies(self, state: Any) -> None:
+        """Let Mitsuba read what a copied scene keeps in another place than the name says."""
+        for node in state.nodes if self._copied else ():
+            name = node.props["filename"] if "filename" in node.props else None
+            if isinstance(name, str) and name in self._copied:
+                node.props["filename"] = str(self._copied[name])
 
     def _drop(self, state: Any, without: tuple[str, ...]) -> None:
         root = state.root.props

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.json_object import parse_json_object
 from fd_mitsuba.training.stage import Stage
 
 FORMAT = 1
@@ -74,7 +75,7 @@ def save_checkpoint(
 
 def list_checkpoints(folder: Path) -> list[Path]:
     """Checkpoint files, oldest first; strays are ignored."""
-    found = [p for p in folder.glob("step_*.safetensors") if p.stem[5:].isdigit()]
+    found = [p for p in folder.glob("step_*.safetensors") if p.stem[5:].isdecimal()]
     return sorted(found, key=lambda p: int(p.stem[5:]))
 
 
@@ -98,7 +99,7 @@ def load_newest(
     for path in reversed(list_checkpoints(folder)):
         try:
             with safe_open(path, framework="pt") as file:
-                header = json.loads((file.metadata() or {}).get(_HEADER_KEY, "null"))
+                header = parse_json_object((file.metadata() or {}).get(_HEADER_KEY, ""))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}
         except (SafetensorError, OSError, ValueError) as error:
             remarks.append(f"{path}: damaged checkpoint passed over ({' '.join(str(error).split())})")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.json_object import parse_json_object
 from fd_mitsuba.io.picture import write_picture
 
 _SHOWN = ("loss_sds", "loss_focal", "loss_collision", "volume_ratio")
@@ -23,15 +24,13 @@ _PLAIN_EVERY_SECONDS = 15.0
 def read_metrics(path: Path) -> list[dict]:
     """The rows of a metrics file; a last line that a kill cut short is dropped."""
     rows = []
-    if path.exists():
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if not isinstance(row, dict):
-                break
-            rows.append(row)
+    if path.is_file():
+        with open(path, encoding="utf-8", errors="replace") as file:
+            for line in file:
+                row = parse_json_object(line)
+                if row is None:
+                    break
+                rows.append(row)
     return rows
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,14 @@ import imageio.v3 as imageio
 import numpy as np
 from PIL import Image
 
+from fd_mitsuba.config.sections import MOST_TURNTABLE_PIXELS
+
 MOST_FRAMES = 48
 _CAPTION, _SHEET_VIEWS = 18, 8  # as `turntable.write_sheet` and its callers have them
 _NOISE = 14  # what a video's codec may do to a flat background
 _QUALITY = 84
+_MOST_PIXELS = MOST_TURNTABLE_PIXELS
+_MOST_PICTURE_PIXELS = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -35,20 +40,43 @@ class Strip:
 
 def video_frames(path: Path) -> np.ndarray | None:
     """At most `MOST_FRAMES` frames (count, height, width, 3) uint8, evenly spaced; None if it cannot be read."""
-    try:
-        frames = imageio.imread(path)
-    except (OSError, ValueError, RuntimeError):
+    if not path.is_file():
         return None
-    return frames[:: math.ceil(len(frames) / MOST_FRAMES)] if frames.ndim == 4 and len(frames) else None
+    frames, pixels = [], 0
+    try:
+        with imageio.imopen(path, "r", plugin="pyav") as video:
+            for frame in video.iter():
+                pixels += frame.shape[0] * frame.shape[1]
+                if pixels > _MOST_PIXELS or (frames and frame.shape != frames[0].shape):
+                    return None
+                frames.append(frame)
+    except Exception:  # the decoders raise errors of a dozen kinds at a damaged file
+        return None
+    return np.stack(frames[:: math.ceil(len(frames) / MOST_FRAMES)]) if frames else None
+
+
+def read_picture(path: Path) -> Image.Image | None:
+    """The decoded picture; None where there is none, or none that can be read, or one of too many pixels."""
+    if not path.is_file():
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                if image.width * image.height > _MOST_PICTURE_PIXELS:
+                    return None
+                image.load()
+                return image
+    except Exception:  # as above
+        return None
 
 
 def sheet_row(path: Path, row: int) -> np.ndarray | None:
     """The eight frames of one row of a contact sheet of `turntable.write_sheet`; None if there is no such row."""
-    try:
-        with Image.open(path) as sheet:
-            pixels = np.asarray(sheet.convert("RGB"))
-    except (OSError, ValueError):
+    sheet = read_picture(path)
+    if sheet is None:
         return None
+    pixels = np.asarray(sheet.convert("RGB"))
     size = pixels.shape[1] // _SHEET_VIEWS
     top = row * (size + _CAPTION) + _CAPTION
     if size == 0 or top + size > len(pixels):

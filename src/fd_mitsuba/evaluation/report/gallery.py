@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.report.metric_table import duration
 from fd_mitsuba.evaluation.report.run_page import PAGE, page_template, turntables
 from fd_mitsuba.evaluation.report.run_record import RunRecord, read_run
@@ -49,10 +50,13 @@ class _Column(NamedTuple):
 def _metric(name: str, group: str | None = None) -> Callable[[RunRecord], float | None]:
     def value(run: RunRecord) -> float | None:
         holder = run.metrics if group is None else run.metrics.get(group, {})
-        found = holder.get(name)
-        return float(found) if isinstance(found, int | float) else None
+        return _number(holder.get(name))
 
     return value
+
+
+def _number(found: object) -> float | None:
+    return float(found) if isinstance(found, int | float) else None
 
 
 def _evaluated(key: str) -> _Column:
@@ -68,7 +72,7 @@ def _evaluated(key: str) -> _Column:
 
 
 _OWN = (
-    _Column("seed", lambda run: run.settings.get("seed"), "{:.0f}".format),
+    _Column("seed", lambda run: _number(run.settings.get("seed")), "{:.0f}".format),
     _Column("inside region", _metric("inside_fraction"), "{:.1%}".format),
     _Column("overlap", _metric("overlap_fraction"), "{:.1%}".format),
     _Column("base PSNR, dB", _metric("base_psnr_db", "appearance"), "{:.0f}".format),
@@ -76,19 +80,39 @@ _OWN = (
 )
 
 
-def write_gallery(folders: Sequence[Path], path: Path, title: str = "Runs") -> Path:
+def write_gallery(
+    folders: Sequence[Path], path: Path, title: str = "Runs", say: Callable[[str], None] = print
+) -> Path:
     """Write the page; returns its path.
 
     Args:
-        folders: run folders, finished or not. Each is linked to its `report.html` where there is one.
+        folders: run folders, finished or not. Each is linked to its `report.html` where there is one. One that is no
+            run, or a damaged one, has a row that says so and costs the others nothing.
+        say: takes a line for each of those.
 
     Raises:
-        UserError: one of them is no run, or the page cannot be written.
+        UserError: none of them can be shown, or the page cannot be written.
     """
-    runs = [read_run(folder) for folder in folders]
+    runs: list[RunRecord] = []
+    bad: dict[Path, str] = {}
+    for folder in folders:
+        try:
+            runs.append(read_run(folder))
+        except UserError as error:
+            bad[folder] = str(error)
     columns = [*_OWN, *(_evaluated(key) for key in _EVALUATED)]
     columns = [column for column in columns if any(column.value(run) is not None for run in runs)]
-    rows = [_row(run, columns, path.resolve().parent) for run in runs]
+    shown = {}
+    for run in runs:
+        try:
+            shown[run.folder] = _row(run, columns, path.resolve().parent)
+        except Exception as error:
+            bad[run.folder] = " ".join(f"{run.folder}: cannot be shown ({type(error).__name__}: {error})".split())
+    if folders and not shown:
+        raise UserError(next(iter(bad.values())))
+    for line in bad.values():
+        say(line)
+    rows = [shown.get(folder) or _bad_row(folder, bad[folder], len(columns)) for folder in folders]
     clips = [run.evaluation.get("clip") for run in runs]
     judges = sorted({str(clip.get("judge")) for clip in clips if isinstance(clip, dict) and clip.get("judge")})
     text = page_template("gallery.html.j2").render(
@@ -114,6 +138,11 @@ def _row(run: RunRecord, columns: Sequence[_Column], root: Path) -> GalleryRow:
         Cell(value, "-" if value is None else column.text(value)) for column, value in zip(columns, values, strict=True)
     ]
     return GalleryRow(run.folder.resolve().name, link, run.prompt, run.state, run.finished, before, after, cells)
+
+
+def _bad_row(folder: Path, reason: str, columns: int) -> GalleryRow:
+    reason = reason.removeprefix(f"{folder}: ")
+    return GalleryRow(folder.resolve().name, None, "", reason, False, None, None, [Cell(None, "-")] * columns)
 
 
 def _thumbs(folder: Path) -> tuple[Strip | None, Strip | None]:

@@ -12,14 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
-from PIL import Image
 
-from fd_mitsuba.errors import Interrupted, RunStopped
+from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.evaluation.report.curves import stage_curves
 from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
 from fd_mitsuba.evaluation.report.run_record import RunRecord, changed_settings, read_run
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, sheet_row, strip, video_frames
+from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, read_picture, sheet_row, strip, video_frames
 
 PAGE = Path(__file__).with_name("page")
 _MOST_GLB_BYTES = 9 << 20
@@ -51,9 +50,21 @@ def write_report(folder: Path) -> Path:
         UserError: no run there, or the page cannot be written.
     """
     run = read_run(folder)
+    try:
+        text = _page(run)
+    except Exception as error:
+        about = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UserError(f"{folder}: cannot be shown ({about}); a file in it was damaged") from error
+    path = folder / "report.html"
+    write_atomically(path, text.encode())
+    return path
+
+
+def _page(run: RunRecord) -> str:
+    folder = run.folder
     part = _film(folder, "turntable_part", "turntable", 3)
     glb, glb_note = _glb(folder)
-    text = page_template("report.html.j2").render(
+    return page_template("report.html.j2").render(
         run=run,
         css=(PAGE / "page.css").read_text(encoding="utf-8"),
         js=(PAGE / "viewer.js").read_text(encoding="utf-8"),
@@ -75,9 +86,6 @@ def write_report(folder: Path) -> Path:
         changed=changed_settings(run.settings),
         origin=figure_tables({"scene": run.identity, "environment": run.environment}, "run"),
     )
-    path = folder / "report.html"
-    write_atomically(path, text.encode())
-    return path
 
 
 @contextmanager
@@ -153,9 +161,12 @@ def _glb(folder: Path) -> tuple[str | None, str]:
             None,
             f"export/asset.glb ({path.stat().st_size >> 20} MB) is too large for this page; open the file itself.",
         )
+    data = path.read_bytes()
+    if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
+        return None, "export/asset.glb is damaged; export the run anew."
     if viewer_script() is None:
         return None, "This installation has no copy of model-viewer; open export/asset.glb in any viewer of glTF."
-    return base64.b64encode(path.read_bytes()).decode(), ""
+    return base64.b64encode(data).decode(), ""
 
 
 def _chips(run: RunRecord) -> list[str]:
@@ -172,7 +183,8 @@ def _tiles(run: RunRecord) -> list[Titled]:
     metrics, tiles = run.metrics, []
 
     def tile(name: str, title: str, form: Callable[[float], str]) -> None:
-        value = metrics.get(name, metrics.get("appearance", {}).get(name))
+        value = metrics.get(name)
+        value = metrics.get("appearance", {}).get(name) if value is None else value
         if isinstance(value, int | float):
             tiles.append(Titled(title, text=form(value)))
 
@@ -180,8 +192,8 @@ def _tiles(run: RunRecord) -> list[Titled]:
     tile("overlap_fraction", "of the part inside the base", "{:.1%}".format)
     tile("base_identical", "base unchanged, byte for byte", lambda value: "yes" if value else "no")
     tile("base_psnr_db", "base outside the part, PSNR", lambda value: "exact" if value >= 199 else f"{value:.0f} dB")
-    faces = metrics.get("part_faces")
-    if isinstance(faces, dict) and faces:
+    faces = metrics.get("part_faces", {})
+    if faces and all(isinstance(count, int) for count in faces.values()):
         tiles.append(Titled("faces of the part", text=f"{sum(faces.values()):,}"))
     clip = run.evaluation.get("clip")
     if isinstance(clip, dict):
@@ -222,8 +234,5 @@ def _sheets(folder: Path) -> list[Titled]:
 
 
 def _picture(path: Path, widest: int) -> str | None:
-    try:
-        with Image.open(path) as image:
-            return picture_uri(image, widest)
-    except (OSError, ValueError):
-        return None
+    image = read_picture(path)
+    return None if image is None else picture_uri(image, widest)

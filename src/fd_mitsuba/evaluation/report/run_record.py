@@ -13,6 +13,9 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.training.record import read_metrics
 
+_GROUPS = ("appearance", "stages", "part_faces")
+"""Entries of `metrics.json` that are objects."""
+_MOST_CHARACTERS = 1 << 18
 _BASE_PROMPT = re.compile(r'name="base_prompt"\s+value="([^"$]+)"')
 
 
@@ -52,7 +55,8 @@ class RunRecord:
         for stage, rows in self.rows.items():
             total = before = 0.0
             for row in rows:
-                now = float(row.get("seconds", before))
+                now = row.get("seconds")
+                now = float(now) if isinstance(now, int | float) else before
                 total += now - before if now >= before else now
                 before = now
             found[stage] = total
@@ -69,11 +73,13 @@ def read_run(folder: Path) -> RunRecord:
     identity, metrics, evaluation, settings, environment = (
         read_json_object(folder / f"{name}.json") or {} for name in names
     )
+    # What is of another type than the run writes was not written by it, and says nothing.
+    metrics = {key: value for key, value in metrics.items() if isinstance(value, dict) or key not in _GROUPS}
     rows: dict[str, list[dict]] = {}
     for row in read_metrics(folder / "metrics.jsonl"):
-        rows.setdefault(str(row.get("stage", "")), []).append(row)
-    commands = folder / "command.txt"
-    lines = commands.read_text(encoding="utf-8", errors="replace").splitlines() if commands.is_file() else []
+        if isinstance(row.get("stage"), str) and isinstance(row.get("step"), int):
+            rows.setdefault(row["stage"], []).append(row)
+    lines = _beginning(folder / "command.txt").splitlines()
     state, finished = _state(metrics, rows, settings)
     return RunRecord(
         folder,
@@ -122,11 +128,18 @@ def _state(metrics: dict, rows: dict[str, list[dict]], settings: dict) -> tuple[
     return f"unfinished: {stage} stage, step {rows[stage][-1].get('step')} of {total or '?'}", False
 
 
+def _beginning(path: Path) -> str:
+    """The first part of a text file, as much as is of use; nothing where there is none."""
+    try:
+        if not path.is_file():
+            return ""
+        with open(path, encoding="utf-8", errors="replace") as file:
+            return file.read(_MOST_CHARACTERS)
+    except OSError:
+        return ""
+
+
 def _recorded_base_prompt(folder: Path, scene: str) -> str:
     """From the run's copy of its scene file, where it stands there as it is."""
-    try:
-        text = (folder / "scene" / Path(scene).name).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""
-    found = _BASE_PROMPT.search(text)
+    found = _BASE_PROMPT.search(_beginning(folder / "scene" / (Path(scene).name or "scene.xml")))
     return found[1] if found else ""
