@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
-from fd_mitsuba.config import RunConfig, misfits, settings_for_run
+from fd_mitsuba.config import ChosenSettings, RunConfig, misfits, settings_for_run
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run import Run
 
@@ -67,7 +67,7 @@ def load_scene(
 
 def edit(
     scene: EditScene | Path | str,
-    config: RunConfig | None = None,
+    config: RunConfig | ChosenSettings | None = None,
     *,
     output: Path | str,
     guidance: Guidance | None = None,
@@ -83,7 +83,7 @@ def edit(
 
     Args:
         scene: from `load_scene`, or a path.
-        config: settings; None: those that suit the built-in prior.
+        config: settings, or a choice of `settings_for_run`, which is then said; None: those that suit the built-in prior.
         output: the run folder; must be new or empty, or hold a run to go on with.
         guidance: any object with the methods of `guidance.interface.Guidance`, in place of the model that the settings
             name. With `guide_appearance` it serves the appearance stage as well.
@@ -102,23 +102,24 @@ def edit(
         say = _nothing if quiet else _to_stderr
     if isinstance(scene, (str, Path)):
         scene = load_scene(scene)
+    opening = []
     if config is None:
-        chosen = settings_for_run(None)
-        config = chosen.config
-        say(str(chosen.remark))
+        config = settings_for_run(None)
+    if isinstance(config, ChosenSettings):
+        opening = [config.remark] if config.remark else []
+        config = config.config
     unknown = set(stages) - set(STAGES)
     if unknown or not stages:
         raise UserError(f"stages = {sorted(stages)}: give any of {', '.join(STAGES)}")
     if guidance is None:
-        for line in misfits(config):
-            say(f"warning: {line}")
+        opening += [f"warning: {line}" for line in misfits(config)]
     from fd_mitsuba.evaluation.report.run_page import reported
     from fd_mitsuba.runs.pipeline import run
 
     folder = Path(output)
     taken = None if geometry_from is None else Path(geometry_from)
     with reported(folder, say):
-        run(scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step)
+        run(scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step, opening)
     result = Run(folder)
     for warning in result.warnings:
         say(f"warning: {warning}")

@@ -39,7 +39,7 @@ def test_there_are_fifteen() -> None:
 
 def test_check_is_clean(loaded: dict[str, EditScene]) -> None:
     for name, scene in loaded.items():
-        report = check_scene(scene, RunConfig())
+        report = check_scene(scene, RunConfig.load("quick"))
         expected = ["not closed"] if name in OPEN else []
         assert len(report.warnings) == len(expected), (name, report.warnings)
         assert all(words in warning for words, warning in zip(expected, report.warnings, strict=True))

@@ -18,10 +18,15 @@ def add_check_command(commands: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    config = chosen_settings(options)
+    settings = chosen_settings(options)
     scene = load(options)
     from fd_mitsuba.runs.check import check_scene
 
-    report = check_scene(scene, config)
-    print(json.dumps(report.to_json(), indent=2) if options.json else "\n".join(report.lines()))
+    report = check_scene(scene, settings.config)
+    if options.json:
+        print(json.dumps(report.to_json(), indent=2))
+        return 0
+    if settings.remark:
+        print(settings.remark.replace(": ", " ", 1))
+    print("\n".join(report.lines()))
     return 0

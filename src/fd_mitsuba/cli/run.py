@@ -27,13 +27,13 @@ def add_run_command(commands: argparse._SubParsersAction) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    config = chosen_settings(options)
+    settings = chosen_settings(options)
     scene = load(options)
     from fd_mitsuba.api import STAGES, edit
 
     run = edit(
         scene,
-        config,
+        settings,
         output=options.output or Path("runs") / Path(options.scene).resolve().parent.name,
         resume=options.resume,
         quiet=options.quiet,

@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fd_mitsuba.cli.options import definitions, machine_options, quiet_libraries, remark
+from fd_mitsuba.cli.options import definitions, machine_options, quiet_libraries
 from fd_mitsuba.errors import UserError
 
 if TYPE_CHECKING:
-    from fd_mitsuba.config import RunConfig
+    from fd_mitsuba.config import ChosenSettings
     from fd_mitsuba.scene.edit_scene import EditScene
 
 
@@ -40,14 +40,11 @@ def settings_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def chosen_settings(options: argparse.Namespace) -> RunConfig:
-    """The settings that the options ask for; how they were chosen, where the options do not say, goes to stderr."""
+def chosen_settings(options: argparse.Namespace) -> ChosenSettings:
+    """The settings that the options ask for, and how they were chosen where the options do not say."""
     from fd_mitsuba.config import settings_for_run
 
-    chosen = settings_for_run(options.config, options.overrides)
-    if chosen.remark:
-        remark(chosen.remark)
-    return chosen.config
+    return settings_for_run(options.config, options.overrides)
 
 
 def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:

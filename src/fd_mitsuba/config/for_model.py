@@ -80,7 +80,6 @@ _SMALL: dict[str, Callable[[Any], bool]] = {
 """The built-in prior decides at high noise what a part becomes, and its gradient is small: see docs/prior.md."""
 _LARGE: dict[str, Callable[[Any], bool]] = {
     "guidance.guidance_scale": lambda scale: scale >= 7,
-    "field.finest_resolution": lambda cells: cells >= 64,
     "appearance.guidance_scale": lambda scale: scale >= 7,
 }
 """With the small scales of the built-in prior, score distillation of Stable Diffusion stays a blur (DreamFusion)."""

@@ -12,13 +12,13 @@ from PIL import Image
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.io.picture import write_picture
+from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.runs.geometry_outcome import with_prompt

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,7 @@ def run(
     geometry_from: Path | None = None,
     guidance: Guidance | None = None,
     on_step: OnStep | None = None,
+    opening: Sequence[str] = (),
 ) -> dict:
     """Grow the part, give it its material, and write the run folder; returns what `metrics.json` holds.
 
@@ -74,6 +75,7 @@ def run(
         guidance: a caller's own, in place of the model that the settings name. The appearance stage takes it too where
             it has `guide_appearance`, and otherwise loads the settings' model.
         on_step: called after each finished step of either stage.
+        opening: lines for `say` once the input has been found to be good: a refusal stays the only line.
 
     Raises:
         UserError, RunStopped, Interrupted: see `training.loop.run_stage`. A run that ends with an error before its
@@ -81,7 +83,7 @@ def run(
     """
     refuse_strange_folder(folder)
     with run_lock(folder, say):
-        return _run(scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step)
+        return _run(scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening)
 
 
 def _run(
@@ -96,6 +98,7 @@ def _run(
     geometry_from: Path | None,
     guidance: Guidance | None,
     on_step: OnStep | None,
+    opening: Sequence[str],
 ) -> dict:
     started = time.monotonic()
     asked, with_assets = stages, "appearance" in stages
@@ -116,6 +119,8 @@ def _run(
         loaded = for_geometry if isinstance(for_geometry, DiffusionGuidance) and guidance is None else None
         own = guidance if hasattr(guidance, "guide_appearance") else None
         for_appearance = prepare_appearance(scene, config, say, listener, loaded, own)
+    for line in opening:
+        say(line)
     if with_geometry:
         geometry = GeometryStage(scene, config, for_geometry)
         with discarded_without_checkpoint(folder):
