@@ -83,7 +83,9 @@ def run(
     """
     refuse_strange_folder(folder)
     with run_lock(folder, say):
-        return _run(scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening)
+        return _run(
+            scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening
+        )
 
 
 def _run(
@@ -119,22 +121,26 @@ def _run(
         loaded = for_geometry if isinstance(for_geometry, DiffusionGuidance) and guidance is None else None
         own = guidance if hasattr(guidance, "guide_appearance") else None
         for_appearance = prepare_appearance(scene, config, say, listener, loaded, own)
-    for line in opening:
-        say(line)
+
+    def begin() -> None:
+        for line in opening:
+            say(line)
+        describe_run(scene, config, folder, command)
+
     if with_geometry:
         geometry = GeometryStage(scene, config, for_geometry)
         with discarded_without_checkpoint(folder):
-            describe_run(scene, config, folder, command)
+            begin()
             run_stage(geometry, folder, resume, quiet, say, on_step)
     elif geometry_from is not None:
         refuse_other_shape(saved_run(geometry_from, say=say)[0], scene, geometry_from)
         geometry = load_finished_stage(scene, config, geometry_from)
         with discarded_without_checkpoint(folder):
-            describe_run(scene, config, folder, command)
+            begin()
             take_geometry(geometry_from, folder)
     else:
         geometry = load_finished_stage(scene, config, folder)
-        describe_run(scene, config, folder, command)
+        begin()
     with rendering_threads():
         metrics = export_geometry(geometry, folder)
     if guidance is not None:
