@@ -83,7 +83,7 @@ def edit(
 
     Args:
         scene: from `load_scene`, or a path.
-        config: settings, or what `settings_for_run` chose, which is then said; None: those that suit the built-in prior.
+        config: settings, or what `settings_for_run` chose and is then said; None: those that suit the built-in prior.
         output: the run folder; must be new or empty, or hold a run to go on with.
         guidance: any object with the methods of `guidance.interface.Guidance`, in place of the model that the settings
             name. With `guide_appearance` it serves the appearance stage as well.
