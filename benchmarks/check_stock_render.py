@@ -34,10 +34,11 @@ from machine import print_figures  # noqa: E402
 from PIL import Image  # noqa: E402
 from torch.nn.functional import avg_pool2d  # noqa: E402
 
+from fd_mitsuba.backend.file_threads import file_threads  # noqa: E402
 from fd_mitsuba.export.pictures import srgb_from_linear  # noqa: E402
 from fd_mitsuba.runs.appearance_outcome import finished_appearance  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
-from fd_mitsuba.scene.scene_file import file_threads, ready_mitsuba  # noqa: E402
+from fd_mitsuba.scene.scene_file import ready_mitsuba  # noqa: E402
 from fd_mitsuba.training.appearance_stage import AppearanceStage  # noqa: E402
 from fd_mitsuba.viewing.lit_views import ring_cameras, some_cameras  # noqa: E402
 

@@ -11,7 +11,8 @@ import torch
 import trimesh
 from conftest import INTEGRATOR, REGION, write_ply
 
-from fd_mitsuba.scene.scene_file import file_threads, ready_mitsuba
+from fd_mitsuba.backend.file_threads import file_threads
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 
 mi = ready_mitsuba()
 

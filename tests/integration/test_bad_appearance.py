@@ -11,11 +11,11 @@ import pytest
 from conftest import BASE, LIGHT
 from PIL import Image
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import load_edit_scene
-from fd_mitsuba.scene.scene_file import file_threads
 
 Make = Callable[..., Path]
 SKY = '<emitter type="envmap" id="sky"><string name="filename" value="sky.exr"/>{}</emitter>'
@@ -95,7 +95,7 @@ CASES = {
     ),
     "metallic NaN": (
         {"part": '<bsdf type="principled" id="part"><float name="metallic" value="nan"/></bsdf>'},
-        ("part", "metallic is nan"),
+        ("part", "metallic holds NaN"),
     ),
 }
 

@@ -312,7 +312,7 @@ def test_one_thread_can_read_an_exr(make_scene: Make, tmp_path: Path) -> None:
         import numpy as np
         from fd_mitsuba.backend import startup
         from fd_mitsuba.scene.edit_scene import load_edit_scene
-        from fd_mitsuba.scene.scene_file import file_threads
+        from fd_mitsuba.backend.file_threads import file_threads
         mi = startup.start(threads=1)
         import drjit as dr
         with file_threads():

@@ -17,9 +17,9 @@ from PIL import Image
 from test_export_assets import Learned, exported, textured_base  # noqa: F401
 from viewer_setup import VIEWERS, needs_blender, needs_browser
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.export.pictures import srgb_from_linear
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
-from fd_mitsuba.scene.scene_file import file_threads
 
 Make = Callable[..., Path]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

@@ -94,7 +94,7 @@ def test_vertex_colours(material_of: Callable[[str], PbrMaterial]) -> None:
         '<bsdf type="principled"><texture type="mesh_attribute" name="base_color">'
         '<string name="name" value="vertex_color"/></texture></bsdf>'
     )
-    assert made.vertex_colour == "vertex_color" and made.base_color == (1.0, 1.0, 1.0)
+    assert made.colours == "vertex_color" and made.base_color == (1.0, 1.0, 1.0)
 
 
 def test_what_is_lost_is_said(material_of: Callable[[str], PbrMaterial]) -> None:

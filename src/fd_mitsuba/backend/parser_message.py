@@ -29,6 +29,7 @@ _REMEDIES: tuple[tuple[str, str], ...] = (
     (r"plugin .* not found", "correct the type"),
     (r"only one integrator", "keep one <integrator>, of type dual_path"),
     (r"well-formed|unsupported xml element|missing required attribute|unexpected", "mend the XML there"),
+    (r"unsupported number of components", "it is CMYK or has an alpha; save the picture as RGB, or as PNG"),
     (r"value for field", "the file is cut short or holds a NaN; write it anew"),
     (r"unknown file format", "give a picture that Mitsuba reads, such as EXR, HDR, PNG or JPEG"),
     (r"could not parse|floating point|integer|boolean", "correct the value"),
@@ -66,11 +67,16 @@ def one_line(
     text = re.sub(r" in property \"_arg_\d+\"|Make sure the object with .*$|\(previous was at .*$", "", text)
     text = re.sub(r"\n\s*-\s*", " ", _LOGGER.sub("", text))
     text = " ".join(text.replace(_SCENE, str(path)).split()).strip(" .!;:")
-    remedy = next((advice for pattern, advice in _REMEDIES if re.search(pattern, text, re.IGNORECASE)), "correct it")
+    remedy = remedy_for(text)
     unknown = re.search(r'Plugin "([^"]*)" not found', text)
     if unknown and (near := _nearest_plugin(mi, unknown.group(1))):
         remedy = f"nearest: {near}"
     return f"{where}: {element + ': ' if element else ''}{text}; {remedy}"
+
+
+def remedy_for(text: str) -> str:
+    """What to do about a message of Mitsuba."""
+    return next((advice for pattern, advice in _REMEDIES if re.search(pattern, text, re.IGNORECASE)), "correct it")
 
 
 def _nearest_plugin(mi: Any, name: str) -> str:

@@ -24,6 +24,8 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 VERTICES = "vertex_positions"
 FACES = "faces"
+NORMALS = "vertex_normals"
+UVS = "vertex_texcoords"
 """Parameter names of `mi.Mesh` in Mitsuba 3.9 (3.10 renames them)."""
 
 _REMEDY = "run `apt-get install libllvm19`, or point DRJIT_LIBLLVM_PATH at a libLLVM of version 16 or newer"

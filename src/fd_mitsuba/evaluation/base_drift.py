@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.judged_views import JudgedViews
 from fd_mitsuba.evaluation.picture_difference import psnr, ssim
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
-from fd_mitsuba.scene.scene_file import SceneElement, SceneFile, file_threads, ready_mitsuba
+from fd_mitsuba.scene.scene_file import SceneElement, SceneFile, ready_mitsuba
 
 _SURFACE_POINTS = 20_000
 Mesh = tuple[np.ndarray, np.ndarray]

@@ -102,7 +102,9 @@ def export_assets(
         for name, data in cut.files().items() if cut is not None else ():
             write(f"ply/{name}", data)
     if "mitsuba" in formats:
-        write_mitsuba(scene, inputs, ready, write, cut, states, {"texture_size": texture_size, "faces": face_budget})
+        corrected = {i: shape.corrected for i, shape in enumerate(whole) if shape is not None and shape.corrected}
+        settings = {"texture_size": texture_size, "faces": face_budget}
+        write_mitsuba(scene, inputs, ready, write, cut, states, settings, corrected)
     return {
         "files": written,
         "base_identical": identical,
@@ -185,13 +187,14 @@ def _earlier_files(scene: EditScene, cut: CutBase | None) -> dict[str, Path]:
 def _gltf_meshes(
     scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart], extras: dict[str, Any]
 ) -> list[GltfMesh]:
-    meshes = []
+    meshes, away = [], np.eye(4)
+    away[:3, 3] = scene.origin  # a GLB has 32 bits for positions, and 64 for a node's place
     earlier = {part.shape: part for part in scene.earlier}
     for shape in shapes:
         vertices, faces, normals, place = shape.vertices, shape.faces, shape.normals, shape.to_world
         if not is_placement(place) or np.linalg.det(place[:3, :3]) < 0:
             vertices, faces, normals = shape.in_user_frame()
-            place = np.eye(4)
+            vertices, place = vertices - scene.origin, away
         tangents = None
         if shape.material.normal_picture is not None and normals is not None and shape.uv is not None:
             tangents = vertex_tangents(vertices, faces, normals, shape.uv)
@@ -211,7 +214,15 @@ def _gltf_meshes(
         about = {**extras, "part": part.name}
         meshes.append(
             GltfMesh(
-                part.label, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv, tangents, extras=about
+                part.label,
+                mesh.vertices - scene.origin,
+                mesh.faces,
+                part.material,
+                mesh.normals,
+                mesh.uv,
+                tangents,
+                to_world=away,
+                extras=about,
             )
         )
     return meshes

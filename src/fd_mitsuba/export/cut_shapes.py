@@ -18,6 +18,7 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
+from fd_mitsuba.export.mesh_ply import attribute_ply
 from fd_mitsuba.export.solid.cut_base import CutMesh, cut_mesh
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -118,20 +119,15 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
 def shape_ply(shape: BaseShape) -> bytes:
     """A binary PLY of a shape in its own frame, every float as it is: v runs as Mitsuba has it, no flip is needed.
 
-    Colours are the `vertex_color` of Mitsuba, linear.
+    Colours are the attribute that the shape's material reads, before the material scales it.
     """
-    columns, names = [shape.vertices], ["x", "y", "z"]
-    for values, own in ((shape.normals, "nx ny nz"), (shape.uv, "s t"), (shape.colours, "r g b")):
-        if values is not None:
-            columns.append(values)
-            names += own.split()
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(shape.vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(shape.faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    rows = np.empty(len(shape.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    rows["count"], rows["index"] = 3, shape.faces
-    data = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
-    return "\n".join(header).encode("ascii") + data.tobytes() + rows.tobytes()
+    attributes, name = {}, shape.material.colours
+    if shape.colours is not None:
+        values = shape.colours / np.float32(shape.material.colour_scale or 1.0)
+        # All corners of a face have one colour where the file gave it to the face.
+        attributes[name] = values[shape.faces[:, 0]] if name.startswith("face_") else values
+    vertices = shape.vertices + shape.moved if shape.moved.any() else shape.vertices
+    return attribute_ply(vertices, shape.faces, shape.normals, shape.uv, attributes)
 
 
 def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple[BaseShape | None, np.ndarray]:

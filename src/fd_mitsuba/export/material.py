@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import colour_picture, grey_values, normal_picture, orm_picture
 from fd_mitsuba.scene.bsdf_reading import COLOURS, read_material
-from fd_mitsuba.scene.scene_file import SceneElement, SceneFile, file_threads
+from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 
 _WRAPPERS = ("twosided", "mask", "normalmap", "bumpmap", "blendbsdf")
 _TRANSPARENT = ("dielectric", "roughdielectric", "thindielectric", "principledthin")
@@ -28,7 +29,8 @@ class PbrMaterial:
         base_picture: sRGB.
         orm_picture: green roughness, blue metallic, linear; where there is one, the two numbers do not count.
         normal_picture: tangent space, y up.
-        vertex_colour: the mesh's colour attribute to multiply with, or "".
+        colours: the mesh's colour attribute to multiply with, or "".
+        colour_scale: what to multiply that with first.
         notes: what the format cannot say, a sentence each.
     """
 
@@ -46,7 +48,8 @@ class PbrMaterial:
     base_picture: Picture | None = None
     orm_picture: Picture | None = None
     normal_picture: Picture | None = None
-    vertex_colour: str = ""
+    colours: str = ""
+    colour_scale: float = 1.0
     notes: tuple[str, ...] = ()
 
 
@@ -160,14 +163,9 @@ def _textured(
 ) -> PbrMaterial:
     colour = next((textures[key] for key in COLOURS if key in textures), None)
     if colour is not None and colour.plugin == "mesh_attribute":
+        scale = float(colour.properties.get("scale", 1.0))
         attribute = str(colour.properties.get("name", ""))
-        if attribute.startswith("vertex_"):
-            scale = float(colour.properties.get("scale", 1.0))
-            base = tuple([min(max(scale, 0.0), 1.0)] * 3)
-            material = replace(material, base_color=base, vertex_colour=attribute)
-        else:
-            notes.append(f"without the colours per face of {attribute}")
-            material = replace(material, base_color=(0.5, 0.5, 0.5))
+        material = replace(material, base_color=(1.0, 1.0, 1.0), colours=attribute, colour_scale=scale)
     elif colour is not None and colour.plugin == "bitmap":
         picture = colour_picture(file, colour, material.name, notes)
         material = replace(material, base_color=(1.0, 1.0, 1.0), base_picture=picture)

@@ -25,6 +25,7 @@ def write_mitsuba(
     cut: CutBase | None,
     states: Mapping[str, StackedPart],
     settings: dict[str, Any],
+    corrected: Mapping[int, bytes],
 ) -> None:
     """Write `mitsuba/scene.xml`, what it reads, and `mitsuba/stack.json`.
 
@@ -34,6 +35,7 @@ def write_mitsuba(
         cut: the base after a cut.
         states: what is said so far of parts that are left out.
         settings: how this was exported, for the record.
+        corrected: number of a base shape -> the PLY to put in the place of a file that Mitsuba would misread.
 
     Raises:
         UserError: a file of the scene that is gone.
@@ -46,15 +48,20 @@ def write_mitsuba(
         }
         bent = part.pictures.get("normal_mitsuba")
         plain.append(MitsubaPart(part.label, f"{part.label}.ply", textures, bent.file_name if bent is not None else ""))
+    replaced: dict[int, str | None] = {number: f"corrected_{number}.ply" for number in corrected}
+    replaced |= {} if cut is None else cut.names(opened)
     data, copies = mitsuba_scene(
         scene,
         inputs,
         plain,
-        None if cut is None else cut.names(opened),
+        replaced,
         [part.shape for part in scene.earlier if part.name in states],
     )
     for name, mesh in cut.files(opened).items() if cut is not None else ():
         write(f"mitsuba/{FILES}/{name}", mesh)
+    for number, mesh in corrected.items():
+        if (name := f"corrected_{number}.ply") == replaced[number]:
+            write(f"mitsuba/{FILES}/{name}", mesh)
     normals = {part.name: part.normal_path(scene.path.parent) for part in scene.earlier if part.name not in states}
     copies |= {path.name: path for path in normals.values() if path is not None}
     for name, source in copies.items():

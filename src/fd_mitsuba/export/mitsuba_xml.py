@@ -57,7 +57,8 @@ def mitsuba_scene(
 
     Args:
         inputs: the scene's files.
-        cut: number of a base shape -> its PLY in the folder `FILES` after a cut, None: nothing is left of it.
+        cut: number of a base shape -> the PLY in the folder `FILES` that takes the place of its file, as after a cut;
+            None: nothing is left of it.
         without: ids of shapes to leave out.
 
     Raises:
@@ -168,9 +169,9 @@ class _Names:
 
 
 def _put_cut_mesh(shape: ET.Element, ply: str) -> None:
-    """Let a base shape read its cut mesh: placed as before if it was a mesh, where it stands if it was analytic."""
+    """Let a base shape read another mesh: placed as before if it was a mesh, where it stands if it was analytic."""
     kept = {"bsdf", "ref", "medium"}
-    named = {"face_normals"} if shape.get("type") in ANALYTIC else {"face_normals", "to_world"}
+    named = {"face_normals"} if shape.get("type") in ANALYTIC else {"face_normals", "flip_normals", "to_world"}
     for child in list(shape):
         if child.tag not in kept and child.get("name") not in named:
             shape.remove(child)
@@ -232,8 +233,9 @@ def _sensor(scene: EditScene) -> ET.Element:
     _put(sensor, "float", "near_clip", f"{0.01 * distance / scene.frame.scale:.6g}")
     _put(sensor, "float", "far_clip", f"{100 * distance / scene.frame.scale:.6g}")
     place = ET.SubElement(sensor, "transform", {"name": "to_world"})
+    digits = 15 if scene.origin.any() else 7
     written = {"origin": origin, "target": target, "up": (0, 1, 0)}
-    ET.SubElement(place, "lookat", {key: ", ".join(f"{v:.7g}" for v in value) for key, value in written.items()})
+    ET.SubElement(place, "lookat", {key: ", ".join(f"{v:.{digits}g}" for v in value) for key, value in written.items()})
     film = ET.SubElement(sensor, "film", {"type": "hdrfilm"})
     _put(film, "integer", "width", "512")
     _put(film, "integer", "height", "512")

@@ -10,6 +10,7 @@ from PIL import Image
 
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture, srgb_from_linear
+from fd_mitsuba.io.float_steps import is_coarse
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,10 @@ class ObjMesh:
 
 
 def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:
-    """File name -> bytes: the OBJ, its MTL and the pictures. Numbers are exact for float32."""
+    """File name -> bytes: the OBJ, its MTL and the pictures. Numbers are exact for float32, or 15 digits.
+
+    Positions have the latter where they lie too far from the origin for float32.
+    """
     files: dict[str, bytes] = {}
     lines = [f"mtllib {name}.mtl"]
     materials: list[str] = []
@@ -43,10 +47,11 @@ def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:
     for mesh in meshes:
         materials += _material_lines(mesh.name, mesh.material, files)
         lines += [f"o {mesh.name}", f"g {mesh.name}", f"usemtl {mesh.name}"]
-        rows = np.asarray(mesh.vertices, dtype=np.float32)
+        far = is_coarse(mesh.vertices)
+        rows = np.asarray(mesh.vertices, dtype=np.float64 if far else np.float32)
         if mesh.colours is not None:
             rows = np.concatenate([rows, srgb_from_linear(mesh.colours).astype(np.float32)], axis=1)
-        lines += _rows("v", rows)
+        lines += _rows("v", rows, "%.15g" if far else "%.9g")
         corner = [mesh.faces + positions + 1]
         if mesh.uv is not None:
             flipped = np.stack([mesh.uv[:, 0], 1.0 - np.asarray(mesh.uv[:, 1], dtype=np.float64)], axis=1)
@@ -71,20 +76,23 @@ def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:
 def ply_with_uv(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> bytes:
     """A binary PLY of vertices (V, 3), unit normals (V, 3) and uv (V, 2) with the origin bottom left, all float32.
 
-    Mitsuba wants `flip_tex_coords` for it.
+    Only positions that lie too far from the origin are float64. Mitsuba wants `flip_tex_coords` for it.
     """
+    kind = "double" if is_coarse(vertices) else "float"
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t")]
+    header += [f"property {kind} {name}" for name in "xyz"]
+    header += [f"property float {name}" for name in ("nx", "ny", "nz", "s", "t")]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     flipped = np.stack([uv[:, 0], 1.0 - np.asarray(uv[:, 1], dtype=np.float64)], axis=1)
-    columns = np.concatenate([vertices, normals, flipped], axis=1)
+    table = np.empty(len(vertices), [("position", "<f8" if kind == "double" else "<f4", 3), ("further", "<f4", 5)])
+    table["position"], table["further"] = vertices, np.concatenate([normals, flipped], axis=1)
     rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     rows["count"], rows["index"] = 3, faces
-    return "\n".join(header).encode("ascii") + np.ascontiguousarray(columns, "<f4").tobytes() + rows.tobytes()
+    return "\n".join(header).encode("ascii") + table.tobytes() + rows.tobytes()
 
 
-def _rows(word: str, values: np.ndarray) -> list[str]:
-    line = " ".join([word] + ["%.9g"] * values.shape[1])
+def _rows(word: str, values: np.ndarray, form: str = "%.9g") -> list[str]:
+    line = " ".join([word] + [form] * values.shape[1])
     return [line % tuple(row) for row in values.tolist()]
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.export.bake.bake import TextureSet
-from fd_mitsuba.scene.scene_file import file_threads
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ EXACT_SHARE = 0.04
 
 _EXACT_BELOW = 60_000
 _CELLS = 32
-_VERSION = b"fd_mitsuba base_sdf 1"
+_VERSION = b"fd_mitsuba base_sdf 2"
 _DIGEST = hashlib.sha256().digest_size
 
 

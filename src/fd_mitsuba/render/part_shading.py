@@ -10,8 +10,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.scene.part_material import PartMaterial
-from fd_mitsuba.scene.scene_file import file_threads
 
 CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 """Fields that can feed a BSDF parameter, and how many numbers they have. `normal` bends the shading frame instead."""

@@ -11,13 +11,17 @@ import numpy as np
 from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
+from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.lit_side import shading_warnings
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.scene.triangle_mesh import Topology, topology
 
 THINNEST_IN_CELLS = 3.0
@@ -81,7 +85,7 @@ class CheckReport:
         lines = [f"scene    {self.scene}", f"prompt   {self.prompt}"]
         for mesh in self.base:
             found = mesh.topology
-            state = "closed" if found.closed else f"open ({found.boundary_edges} boundary edges)"
+            state = _closedness(found)
             pieces = f"{found.components} component{'s' if found.components != 1 else ''}"
             lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
         lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
@@ -131,8 +135,23 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         grid_high=_user_corner(scene, GRID_HALF_EXTENT),
         regions=regions,
         cost=cost,
-        warnings=tuple(_base_warnings(base) + _region_warnings(regions, config) + _scene_warnings(scene, config)),
+        warnings=tuple(
+            _size_warnings(used)
+            + _base_warnings(base)
+            + _region_warnings(regions, config)
+            + _scene_warnings(scene, config)
+        ),
     )
+
+
+def _closedness(found: Topology) -> str:
+    if found.boundary_edges:
+        return f"open ({found.boundary_edges} boundary edges)"
+    if found.closed:
+        return "closed"
+    if found.misoriented_edges:
+        return f"without holes, but {found.misoriented_edges} edges have faces that point opposite ways"
+    return f"without holes, but {found.nonmanifold_edges} edges have an odd number of faces"
 
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
@@ -158,6 +177,10 @@ def _region(scene: EditScene, region: FocalRegion, distance: MeshDistance, cell:
     )
 
 
+def _size_warnings(used: np.ndarray) -> list[str]:
+    return [f"base: {warning}" for warning in size_warnings(used)]
+
+
 def _base_warnings(base: tuple[BaseCheck, ...]) -> list[str]:
     warnings = []
     for mesh in base:
@@ -167,8 +190,6 @@ def _base_warnings(base: tuple[BaseCheck, ...]) -> list[str]:
                 f"{name}: not closed ({found.boundary_edges} boundary edges); its holes count as filled "
                 "where most of the surface around them exists: fill them if the part grows there"
             )
-        if found.closed and mesh.volume < 0:
-            warnings.append(f"{name}: its faces point inwards; flip them, or it is lit from the wrong side")
         if found.misoriented_edges:
             warnings.append(
                 f"{name}: {found.misoriented_edges} edges between faces that point opposite ways; "
@@ -213,7 +234,7 @@ def _region_warnings(regions: tuple[RegionCheck, ...], config: RunConfig) -> lis
 
 
 def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
-    warnings = []
+    warnings = list(scene.warnings)
     if not scene.base_prompt:
         warnings.append("no base_prompt: preservation scores and before/after prompts lack it; describe the base")
     elif scene.base_prompt.casefold() == scene.prompt.casefold():
@@ -226,6 +247,8 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
             warnings.append(f"no material can be learned, only a shape (--stage geometry): {error}")
     else:
         warnings.append("no emitter: previews use a lamp of their own; add an envmap for the appearance")
+        loaded, shapes = base_shapes(scene)
+        warnings += shading_warnings(ready_mitsuba(), loaded, shapes, scene.base)
     warnings += misfits(config)
     if config.geometry.lambda_focal == 0:
         warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")

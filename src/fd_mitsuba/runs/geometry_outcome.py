@@ -25,6 +25,7 @@ from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.io.ply import ply_bytes
 from fd_mitsuba.runs.locality import measure_locality
+from fd_mitsuba.runs.own_meshes import as_mesh, base_mesh, edited_mesh, start_mesh
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneFile
@@ -102,7 +103,7 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
         union = stage.surface()
     parts = {name: part_solid(stage, name) for name in scene.parts}
     figures: dict[str, Any] = {}
-    opened = None
+    opened = cut = None
     if scene.subtracts:
         cut = cut_out(scene, parts)
         figures = cut.figures
@@ -122,7 +123,7 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
     base = scene.base_canonical
     locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
     whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage, None)
-    _write_turntable(stage, (torch.from_numpy(whole.vertices), torch.from_numpy(whole.faces)), folder)
+    _write_turntable(stage, whole, cut, folder)
     return {
         "version": __version__,
         "prompt": scene.prompt,
@@ -151,21 +152,18 @@ def removed_parts(scene: EditScene, cut: CutBase) -> dict[str, Solid]:
     return {name: solid.moved(scene.frame.matrix()) for name, solid in cut.removed.items()}
 
 
-def _write_turntable(stage: GeometryStage, part: tuple[torch.Tensor, torch.Tensor], folder: Path) -> None:
-    output, aim = stage.config.output, stage.aim
-    with torch.no_grad():
-        union = stage.surface()
-    start = stage.start_surface()
-    edited = (union.vertices, union.faces)
-    base = (stage.base_surface.vertices, stage.base_surface.faces)
-    for name, mesh in {"turntable": edited, "turntable_base": base, "turntable_part": part}.items():
+def _write_turntable(stage: GeometryStage, part: Solid, cut: CutBase | None, folder: Path) -> None:
+    """Videos and the contact sheet. The base is drawn with its own triangles, not as a grid of the run sees it."""
+    scene, output, aim = stage.scene, stage.config.output, stage.aim
+    base, edited, alone = base_mesh(scene), edited_mesh(scene, part, cut), as_mesh(part.vertices, part.faces)
+    for name, mesh in {"turntable": edited, "turntable_base": base, "turntable_part": alone}.items():
         frames = render_ring(mesh, output.turntable_frames, output.turntable_size, aim)
         write_video(frames, folder / "videos" / f"{name}.mp4")
     size = min(output.turntable_size, 192)
     rows = {
         "base": render_ring(base, _SHEET_VIEWS, size, aim),
-        "base with the focal regions": render_ring((start.vertices, start.faces), _SHEET_VIEWS, size, aim),
-        f"result: {stage.scene.prompt}": render_ring(edited, _SHEET_VIEWS, size, aim),
-        "part": render_ring(part, _SHEET_VIEWS, size, aim),
+        "base with the focal regions": render_ring(start_mesh(scene), _SHEET_VIEWS, size, aim),
+        f"result: {scene.prompt}": render_ring(edited, _SHEET_VIEWS, size, aim),
+        "part": render_ring(alone, _SHEET_VIEWS, size, aim),
     }
     write_sheet(rows, folder / "images" / "turntable.png")

@@ -103,6 +103,8 @@ def _run(
     opening: Sequence[str],
 ) -> dict:
     started = time.monotonic()
+    for warning in scene.warnings:
+        say(warning)
     asked, with_assets = stages, "appearance" in stages
     if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
         if "geometry" not in stages:

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.backend.aligned_memory import aligned
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.bsdf_reading import Reading, read_material
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.plugins import FOCAL_REGION
-from fd_mitsuba.scene.scene_file import file_threads, ready_mitsuba
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 
 _LIFT = 0.01
 """How far above a curved shape's triangles, in canonical units, the ray starts that finds the shape itself."""

@@ -12,9 +12,13 @@ import numpy as np
 
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.float_steps import is_coarse, size_problem
+from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
+from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
+from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
 from fd_mitsuba.scene.normalisation import Normalisation
@@ -22,7 +26,7 @@ from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
 from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
-from fd_mitsuba.scene.region_place import gap_to_base, misplacement
+from fd_mitsuba.scene.region_place import gap_to_base, hidden_regions, misplacement
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
@@ -49,6 +53,7 @@ class EditScene:
         regions_path: the file of regions beside the scene; None: the scene says itself.
         regions_parameters: the `-D` values that it was read with.
         earlier: the parts of earlier rounds, which are among the meshes of `base`.
+        warnings: what is wrong with its files but was mended, and what Mitsuba warned of, a line each.
     """
 
     path: Path
@@ -65,6 +70,7 @@ class EditScene:
     regions_path: Path | None = None
     regions_parameters: dict[str, str] = field(default_factory=dict)
     earlier: tuple[StackedPart, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def parts(self) -> dict[str, tuple[FocalRegion, ...]]:
@@ -76,6 +82,13 @@ class EditScene:
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
         return self.regions[0].mode == SUBTRACT
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        """(3,) what to subtract from the user frame's coordinates before they become 32-bit floats: 0 unless the base
+        lies so far away that these are too coarse."""
+        used = self.base_soup.vertices[np.unique(self.base_soup.faces)]
+        return np.round(self.frame.centre) if is_coarse(used) else np.zeros(3)
 
     @cached_property
     def base_soup(self) -> TriangleMesh:
@@ -120,6 +133,8 @@ def load_edit_scene(
     """
     inputs = EditInputs.open(Path(path), parameters or {}, None if regions is None else Path(regions))
     file = inputs.scene
+    for source in inputs.sources:
+        refuse_broken_properties(source)
     base = tuple(_base_mesh(file, element) for element in base_elements(file))
     earlier = earlier_parts(file.path, base)
     latest = max(earlier, key=lambda part: part.round, default=None)
@@ -138,15 +153,19 @@ def load_edit_scene(
     soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
+    hidden = hidden_regions(found, distance)
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
-        if problem := misplacement(region, gap, frame):
+        problem = misplacement(region, gap, frame)
+        if problem is None and region.name in hidden:
+            problem = "lies wholly within the base, where nothing of the part is ever seen; move it outwards"
+        if problem:
             error = element.error(problem)
             if on_misplaced is None:
                 raise error
             on_misplaced(error)
     check_modes([element for _, element in elements], found, base, frame)
     for source in inputs.sources:
-        source.instantiate()
+        refuse_broken_parameters(source, source.instantiate())
     folder = file.path.parent
     record = [folder / RECORD_NAME, *(part.normal_path(folder) for part in earlier)] if earlier else []
     return EditScene(
@@ -164,6 +183,7 @@ def load_edit_scene(
         regions_path=inputs.regions.path if inputs.regions else None,
         regions_parameters=inputs.regions.parameters if inputs.regions else {},
         earlier=earlier,
+        warnings=tuple(dict.fromkeys(line for source in inputs.sources for line in source.warnings)),
     )
 
 
@@ -210,10 +230,13 @@ def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> 
     except NotAMesh:
         raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None
     except BrokenMesh as error:
-        raise element.error(f"{subject}{error}; repair the mesh and save it anew") from None
+        fault = mesh_fault(file.resolve(filename)) if filename else None
+        raise element.error(f"{subject}{fault or f'{error}; repair the mesh and save it anew'}") from None
     except ValueError as error:
         raise element.error(f"{error}; save it as one of these") from None
     except RuntimeError as error:
+        if filename and (fault := mesh_fault(file.resolve(filename))):
+            raise element.error(f"{subject}{fault}") from None
         problem = str(file.translated(error)).removeprefix(f"{file.path}: ")
         raise element.error(f"{subject}{problem}") from None
 
@@ -227,6 +250,13 @@ def _base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:
             f"trimesh.load({name!r}, force='mesh').export({saved!r})"
         )
     vertices, faces = _triangles(file, element, filename)
+    if filename and Path(filename).suffix.lower() == ".obj":
+        concave = obj_concave_face(file.resolve(filename))
+        if concave is not None:
+            raise element.error(
+                f"{filename}: face {concave} is not convex, and Mitsuba cuts it into triangles that lie outside of it; "
+                "triangulate the mesh as you export it"
+            )
     sources = (file.resolve(filename),) if filename else ()
     return TriangleMesh(element.id or BASE_NAME, vertices, faces, sources)
 
@@ -241,6 +271,8 @@ def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
         raise UserError(
             f"{file.path}: base {names}: all its vertices are at one point; give a mesh with a size"
         ) from None
+    if problem := size_problem(float(np.ptp(used, axis=0).max())):
+        raise UserError(f"{file.path}: base {names}: {problem}")
     if not encloses_volume(TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)):
         count = len(soup.faces)
         raise UserError(
@@ -258,8 +290,15 @@ def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame
         vertices, faces = _triangles(file, element, filename)
         if not topology(vertices, faces).closed:
             raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
+        twice = len(faces) - len(without_reversed_copies(vertices, faces))
+        if twice:
+            problem = f"{twice} faces of the region's mesh are there twice, once each way round"
+            raise element.error(f"{filename}: {problem}; remove the copies")
         mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, (file.resolve(filename),))
     region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element))
     if not region.volume > 0:
         raise element.error("the region has no volume; enlarge it")
+    if mesh is not None and not region.has_inside():
+        problem = "the region's mesh has no inside, because pieces of it cancel each other"
+        raise element.error(f"{filename}: {problem}; make the faces of all pieces point outwards")
     return region

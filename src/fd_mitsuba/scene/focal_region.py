@@ -85,6 +85,16 @@ class FocalRegion:
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         return float(max(2.0 * self.sdf(points).max(), 0.0))
 
+    def has_inside(self) -> bool:
+        """Whether any point just beside the middle of a face is within the region."""
+        surface = self.surface(2)
+        corners = surface.vertices[surface.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        step = 1e-3 * self.size * normal / np.where(length > 0, length, 1)
+        middle = corners.mean(axis=1)
+        return bool((self.sdf(np.concatenate([middle - step, middle + step])) > 0).any())
+
     def sdf(self, points: np.ndarray) -> np.ndarray:
         """(N,) float32 exact signed distance to the region's surface, inside positive.
 

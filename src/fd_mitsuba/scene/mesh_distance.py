@@ -10,6 +10,8 @@ from __future__ import annotations
 import igl
 import numpy as np
 
+from fd_mitsuba.scene.doubled_faces import without_reversed_copies
+
 _CHUNK = 200_000
 
 
@@ -19,7 +21,7 @@ class MeshDistance:
     Args:
         vertices: (V, 3), any frame and unit; finite.
         faces: (F, 3) indices into `vertices`, at least one face. Open meshes, several overlapping components,
-            duplicate vertices and zero-area faces are fine.
+            duplicate vertices, zero-area faces and faces that are there once each way round are fine.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -30,7 +32,7 @@ class MeshDistance:
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
         self._winding = igl.FastWindingNumberBVH()
-        self._winding.init(self._vertices, self._faces)
+        self._winding.init(self._vertices, without_reversed_copies(self._vertices, self._faces))
 
     def unsigned(self, points: np.ndarray) -> np.ndarray:
         """(N,) float64 distance to the nearest face, exact to rounding; `points` is (N, 3) in the mesh's frame."""

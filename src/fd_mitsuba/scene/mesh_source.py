@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fd_mitsuba.backend.startup import FACES, VERTICES
+from fd_mitsuba.io.float_steps import is_coarse
+from fd_mitsuba.scene.double_positions import double_positions
 from fd_mitsuba.scene.tessellate import Arrays, tube, unit_disk, unit_sphere
 
 FILE_SHAPES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
@@ -27,7 +30,8 @@ class BrokenMesh(Exception):
 def shape_triangles(mi: Any, plugin: str, properties: dict[str, Any], to_world: np.ndarray) -> Arrays:
     """Vertices (V, 3) float64 after `to_world` and faces (F, 3) int64 of one Mitsuba shape, checked.
 
-    Faces are turned round where `to_world` mirrors, so that outward stays outward.
+    Positions have the 64 bits of a PLY or an OBJ where they lie so far from the origin that Mitsuba's 32 show. Faces
+    are turned round where `to_world` mirrors, so that outward stays outward.
 
     Args:
         mi: mitsuba with its variant set.
@@ -83,4 +87,7 @@ def _local_triangles(mi: Any, plugin: str, properties: dict[str, Any]) -> Arrays
         raise NotAMesh
     vertices = np.array(parameters[VERTICES], dtype=np.float64).reshape(-1, 3)
     faces = np.array(parameters[FACES]).astype(np.int64).reshape(-1, 3)
+    filename = properties.get("filename")
+    if isinstance(filename, str) and np.isfinite(vertices).all() and is_coarse(vertices):
+        vertices = double_positions(Path(str(mi.file_resolver().resolve(filename))), vertices)
     return vertices, faces

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.conventions import DEFAULT_PART_NAME, TEXTURE_CHANNELS
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.bsdf_reading import COLOURS, PlainMaterial, child_objects, read_material
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.scene_file import file_threads
 
 _PARAMETERS = {"base_color": COLOURS, "roughness": ("roughness", "alpha"), "metallic": ("metallic",)}
 """The parameters that a channel may feed, the first that the BSDF takes a texture for."""

@@ -81,6 +81,8 @@ def _check_solid(element: SceneElement, mesh: TriangleMesh) -> None:
     found = topology(mesh.vertices, mesh.faces)
     if not found.closed or found.nonmanifold_edges:
         problem = f"is not closed ({found.boundary_edges} boundary edges)"
+        if not found.boundary_edges:
+            problem = f"has {found.misoriented_edges} edges whose faces point opposite ways"
         if found.nonmanifold_edges:
             problem = f"has {found.nonmanifold_edges} edges of more than two faces"
         raise element.error(f"base {mesh.name!r} {problem}, so nothing can be cut out of it; repair it")

@@ -28,6 +28,16 @@ def misplacement(region: FocalRegion, gap: float, frame: Normalisation) -> str |
     return None
 
 
+def hidden_regions(regions: tuple[FocalRegion, ...], base: MeshDistance) -> set[str]:
+    """Names of the regions that lie wholly within the base and so do all others of their part, which is to be added."""
+    within = {
+        region.name: region.mode != SUBTRACT and bool(base.inside(region.surface(3).vertices).all())
+        for region in regions
+    }
+    seen = {region.part for region in regions if not within[region.name]}
+    return {region.name for region in regions if region.part not in seen}
+
+
 def share_in_grid(region: FocalRegion, samples: int = 24) -> float:
     """Share of the region's volume within the grid cube [-1.05, 1.05]^3, sampled on a lattice over its bounds."""
     low, high = region.bounds

@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from fd_mitsuba.backend import startup
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.backend.parser_message import one_line
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.file_faults import fault_of_file
+from fd_mitsuba.scene.mesh_numbers import correct_mesh
+from fd_mitsuba.scene.mitsuba_warnings import mitsuba_warnings
 from fd_mitsuba.scene.plugins import register
 from fd_mitsuba.scene.scene_copy import copied_files
 from fd_mitsuba.scene.xml_guard import refuse_plugin_path, scan_scene
@@ -26,21 +30,6 @@ def ready_mitsuba() -> Any:
     mi = loaded if loaded is not None and loaded.variant() is not None else startup.start()
     register(mi)
     return mi
-
-
-@contextmanager
-def file_threads() -> Iterator[None]:
-    """At least two Dr.Jit threads while it lasts: with one, Mitsuba 3.9 waits forever when it reads an EXR."""
-    import drjit as dr
-
-    threads = dr.thread_count()
-    if threads < 2:
-        dr.set_thread_count(2)
-    try:
-        yield
-    finally:
-        if threads < 2:
-            dr.set_thread_count(threads)
 
 
 @dataclass(frozen=True)
@@ -88,6 +77,9 @@ class SceneFile:
         path: the XML file.
         parameters: values for `$name`; a `$` within a value is literal.
 
+    Attributes:
+        warnings: of the last `instantiate`, a line each: what Mitsuba warned of, numbers of meshes that were mended.
+
     Raises:
         UserError: whatever `xml_guard.scan_scene` refuses; XML or references that Mitsuba cannot read; an undefined
             `$name`; a plugin type that is a path; objects nested too deep; a file that the scene names but that is
@@ -97,6 +89,7 @@ class SceneFile:
     def __init__(self, path: Path | str, parameters: dict[str, str] | None = None) -> None:
         self.path = Path(path)
         self.parameters = dict(parameters or {})
+        self.warnings: tuple[str, ...] = ()
         self.text = scan_scene(self.path, self.parameters)
         self.mi = ready_mitsuba()
         self._copied = copied_files(self.path)
@@ -128,11 +121,20 @@ class SceneFile:
                 self._drop(state, without)
             self._find_copies(state)
             try:
-                with file_threads():
+                with file_threads(), mitsuba_warnings(self.mi) as said:
                     scene = self.mi.parser.instantiate(self._config(), state)
             except RuntimeError as error:
-                raise self.translated(error) from None
-        return scene[0] if isinstance(scene, list) else scene
+                raise (fault_of_file(self, error) or self.translated(error)) from None
+            scene = scene[0] if isinstance(scene, list) else scene
+            kept = [shape for shape in self.top_level("shape") if not {shape.kind, shape.plugin} & set(without)]
+            shapes = scene.shapes() if kept else []
+            # A plugin that makes several shapes of one, such as `merge`, leaves nothing to say which is whose.
+            pairs = zip(kept, shapes, strict=True) if len(kept) == len(shapes) else ()
+            numbers = [correct_mesh(self, element, shape) for element, shape in pairs]
+            answered = tuple(start for item in numbers for start in item.answered)
+            told = (f"{self.path}: Mitsuba: {line}" for line in said if not line.startswith(answered))
+            self.warnings = (*told, *(line for item in numbers for line in item.warnings))
+        return scene
 
     def description(self, element: SceneElement) -> dict[str, Any]:
         """The element and all below it as a dictionary for `mi.load_dict`, files with their full paths.

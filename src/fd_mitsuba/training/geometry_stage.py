@@ -65,6 +65,11 @@ class GeometryStage:
         self.sdf_base = torch.from_numpy(base_sdf(points, base.vertices, base.faces))
         regions = torch.from_numpy(np.stack([region.sdf(points) for region in scene.regions]))
         self.region_sdf = regions.amax(dim=0)
+        if not bool((self.region_sdf > 0).any()):
+            raise UserError(
+                f"{scene.path}: no vertex of the grid lies within a focal region; thicken them, or raise "
+                f"geometry.grid_resolution={geometry.grid_resolution}"
+            )
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.field_losses = FieldLosses(

@@ -178,7 +178,7 @@ def _hdr_pictures() -> tuple[np.ndarray, ...]:
 
 def read_environment(path: Path) -> np.ndarray:
     """An HDR picture averaged down to (HEIGHT, WIDTH, 3), its mean brought to 1."""
-    from fd_mitsuba.scene.scene_file import file_threads
+    from fd_mitsuba.backend.file_threads import file_threads
 
     mi = start()
     with file_threads():
