@@ -1,6 +1,7 @@
 # Everything runs in .venv, which the first target that needs it creates.
 #   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
 #   make test                              all fast tests (minutes); PYTEST_ARGS="-k union -x" narrows them down
+#   make fuzz N=5000 SEED=1           spoiled inputs, and a table of how the command line takes them
 #   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
@@ -10,11 +11,13 @@ OUT ?= runs/demo
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
 PYTEST_ARGS ?=
+N ?= 500
+SEED ?= 0
 
 PY := .venv/bin/python
 STAMP := .venv/.installed
 
-.PHONY: demo test bench lint clean install llvm
+.PHONY: demo test fuzz bench lint clean install llvm
 .DEFAULT_GOAL := demo
 
 install: $(STAMP)
@@ -33,6 +36,9 @@ demo: $(STAMP) llvm
 
 test: $(STAMP) llvm
 	$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
+
+fuzz: $(STAMP) llvm
+	$(PY) tests/fuzz/fuzzer.py -n $(N) --seed $(SEED) --workers 2 --refusals vague
 
 bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
+_HIDDEN = re.compile(
+    "[\x00-\x1f\x7f-\x9f"  # control characters: colours, titles, cursor
+    "\u200e\u200f\u202a-\u202e\u2066-\u2069"  # writing direction, which shows text in another order
+    "\u2028\u2029\ufeff\ud800-\udfff]"  # line separators, byte order mark, halves of characters
+)
+
 
 class UserError(Exception):
     """Bad input: the message is one line that names the file, the element and what to do. Exit code 1."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        super().__init__(printable(" ".join(message.split())))
 
 
 class RunStopped(UserError):
@@ -22,3 +30,8 @@ def first_line(error: BaseException) -> str:
     """The first line of another library's message, or the error's type where it has none."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return (lines[0] if lines else type(error).__name__)[:200]
+
+
+def printable(line: str) -> str:
+    """A line for a terminal or a log, with what would not be seen but obeyed shown as `\\x1b`."""
+    return _HIDDEN.sub(lambda match: match.group().encode("unicode_escape", "surrogatepass").decode(), line)

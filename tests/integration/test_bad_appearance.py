@@ -145,7 +145,8 @@ def test_negative_light_is_a_warning(make_scene: Make, tmp_path: Path, mi: Any) 
 def test_texture_that_is_not_finite(make_scene: Make, tmp_path: Path, mi: Any) -> None:
     picture(tmp_path / "paint.exr", mi, sky(_nan))
     paint = texture("reflectance", "paint.exr")
-    ball = f'<shape type="sphere" id="body"><float name="radius" value="0.3"/><bsdf type="diffuse">{paint}</bsdf></shape>'
+    small = '<float name="radius" value="0.3"/>'
+    ball = f'<shape type="sphere" id="body">{small}<bsdf type="diffuse">{paint}</bsdf></shape>'
     assert "paint.exr holds NaN" in message_of(make_scene(base=ball))
 
 

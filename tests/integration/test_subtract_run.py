@@ -239,7 +239,7 @@ CASES = {
     "unknown mode": ({"region": region(mode="carve")}, ("bite", "'carve'", "'add'", "'subtract'")),
     "mode not text": (
         {"region": region().replace('<string name="mode" value="subtract"/>', '<float name="mode" value="1"/>')},
-        ("bite", "mode 1.0"),
+        ("bite", "mode is a number, not text"),
     ),
     "both modes": (
         {"region": region() + region("ear", "add", part="ear")},

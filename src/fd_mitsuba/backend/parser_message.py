@@ -12,7 +12,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _SOURCE = re.compile(r"\[[\w.]+\.(?:cpp|h|inl):\d+\]\s*")
 _LOGGER = re.compile(r"\[[A-Z]\w*\]\s*")
 _SCENE = "\0"  # stands for the scene's own path, which may hold blanks and colons
-_LOCATION = re.compile(r"(?:(\0|\S+\.xml|string) )?\(line (\d+), col (\d+)\)")
+_LOCATION = re.compile(r"(?:string )?\(line (\d+), col \d+\)")
 _LEAD = re.compile(
     r"(?:Error while loading|While loading|At|while processing <include>)\s*(?:dictionary node \"[^\"]*\"|\S*)\s*:\s*"
     r"|failed to instantiate \w+ plugin of type \"[^\"]*\"\s*:\s*"
@@ -38,28 +38,31 @@ _REMEDIES: tuple[tuple[str, str], ...] = (
 )
 
 
+MITSUBA_ERRORS = (RuntimeError, UnicodeDecodeError)
+"""What a call into Mitsuba raises: the second where its message quotes bytes of a file that are not UTF-8."""
+
+
 def one_line(
-    error: BaseException, path: Path, describe: Callable[[int, int], str] | None = None, mi: Any = None
+    error: BaseException, path: Path, place: Callable[[int], tuple[str, str]] | None = None, mi: Any = None
 ) -> str:
     """A Mitsuba error as `file:line: <element>: what; remedy`, without source lines, colours or tracebacks.
 
     Args:
-        path: the scene file, named if the error names no other.
-        describe: the element at a line and column, such as `<shape type="ply" id="base">`; may return "".
+        path: the scene file, named where the error has no line.
+        place: file and line, and the element there, of a line of what Mitsuba parsed; see `NormalisedXml.place`.
         mi: the module, to name the plugin nearest to an unknown one.
     """
-    text = _COLOUR.sub("", str(error))
+    is_bytes = isinstance(error, UnicodeDecodeError)
+    text = _COLOUR.sub("", error.object.decode(errors="backslashreplace") if is_bytes else str(error))
     if "Traceback (most recent call last)" in text:
         head, _, trace = text.partition("Traceback (most recent call last)")
         text = head + re.sub(r"^[\w.]+(?:Error|Exception): ", "", trace.strip().splitlines()[-1].strip())
     text = _SOURCE.sub("", text).replace(str(path), _SCENE)
     where, element = str(path), ""
     locations = _LOCATION.findall(text)
-    if locations:
-        source, line, column = locations[-1]  # the innermost
-        own = source in ("", _SCENE)
-        where = f"{path if own else source}:{line}"
-        element = describe(int(line), int(column)) if describe and own else ""
+    if locations and place:
+        found, element = place(int(locations[-1]))  # the innermost
+        where = found or where
     text = _LEAD.sub("", _LOCATION.sub("", text))
     text = re.sub(r"(?:Parsing of XML file \"[^\"]*\"|XML parsing) failed\s*:", "not well-formed XML:", text)
     text = re.sub(r"Error while loading \w+ file \"[^\"]*\"\s*:\s*(?:\"[^\"]*\"\s*:\s*)?", "", text)

@@ -158,7 +158,7 @@ def perform(
             return Outcome(job, FINISHED, "its worker was killed, the run was not", attempts=attempts(job, token))
         started, offset = time.monotonic(), log.tell()
         words = job.words(threads)
-        log.write(f"# {token} {' '.join(words)}\n".encode())
+        log.write(f"# {token} {' '.join(words)}\n".encode(errors="surrogateescape"))
         log.flush()
         code = _wait([*program, *words], log, stops)
     seconds, count = time.monotonic() - started, attempts(job, token)

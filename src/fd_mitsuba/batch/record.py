@@ -9,8 +9,10 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from fd_mitsuba.batch.job import FAILED, Job, Outcome
+from fd_mitsuba.errors import printable
 from fd_mitsuba.io.json_object import read_json_object
 
 _STYLES = {"finished": "green", "skipped": "dim", "failed": "bold red", "interrupted": "yellow"}
@@ -43,6 +45,6 @@ def print_table(outcomes: Sequence[Outcome], console: Console) -> None:
         log = f" ({outcome.job.log})" if outcome.state == FAILED else ""
         state = f"[{_STYLES.get(outcome.state, '')}]{outcome.state}[/]" if outcome.state in _STYLES else outcome.state
         cells = (f"{outcome.seconds:.0f}" if outcome.seconds else "", str(outcome.attempts or ""))
-        remark = (outcome.message + log).replace("[", r"\[")
-        table.add_row(outcome.job.name, state, *cells, remark)
+        name, remark = (Text(printable(text)) for text in (outcome.job.name, outcome.message + log))
+        table.add_row(name, state, *cells, remark)
     console.print(table)

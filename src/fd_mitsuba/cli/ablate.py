@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from fd_mitsuba.cli.evaluate import batch_options, judge_options
-from fd_mitsuba.cli.options import machine_options, remark, start
+from fd_mitsuba.cli.options import machine_options, remark, say, start
 
 
 def add_ablate_commands(commands: argparse._SubParsersAction) -> None:
@@ -67,5 +67,5 @@ def _ablate(options: argparse.Namespace) -> int:
     write_atomically(folder / "ablation.md", (note + markdown_table(titles, cells)).encode())
     write_ablation_sheet(results, folder / "ablation.png")
     Console(width=None if os.isatty(1) else 200).print(rich_table(titles, cells, f"judge: {judge.name}"))
-    print(f"{folder}: ablation.json, ablation.md, ablation.png")
+    say(f"{folder}: ablation.json, ablation.md, ablation.png")
     return 0 if all(len(result.folders) == len(options.seeds) for result in results) else 1

@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from fd_mitsuba.cli.options import remark
+from fd_mitsuba.cli.options import remark, say
 from fd_mitsuba.errors import UserError
 
 
@@ -70,7 +70,7 @@ def _batch(options: argparse.Namespace) -> int:
     if runs:
         from fd_mitsuba.evaluation.report.gallery import write_gallery
 
-        print(write_gallery(runs, folder / "gallery.html", folder.resolve().name, remark))
+        say(write_gallery(runs, folder / "gallery.html", folder.resolve().name, remark))
     states = {outcome.state for outcome in outcomes}
     if "interrupted" in states:
         remark("interrupted; repeat the command to go on")

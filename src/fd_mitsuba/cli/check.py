@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
+from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
 
 
@@ -27,6 +28,6 @@ def _check(options: argparse.Namespace) -> int:
         print(json.dumps(report.to_json(), indent=2))
         return 0
     if settings.remark:
-        print(settings.remark.replace(": ", " ", 1))
-    print("\n".join(report.lines()))
+        say(settings.remark.replace(": ", " ", 1))
+    say("\n".join(report.lines()))
     return 0

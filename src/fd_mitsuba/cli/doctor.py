@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
+from fd_mitsuba.cli.options import say
+
 
 def add_doctor_command(commands: argparse._SubParsersAction) -> None:
     """Put `doctor` beside the other commands."""
@@ -21,5 +23,5 @@ def _doctor(options: argparse.Namespace) -> int:
         print(json.dumps({finding.name: {"ok": finding.ok, "found": finding.text} for finding in findings}, indent=2))
     else:
         for finding in findings:
-            print(f"{'ok ' if finding.ok else 'BAD'} {finding.name}: {finding.text}")
+            say(f"{'ok ' if finding.ok else 'BAD'} {finding.name}: {finding.text}")
     return 0 if all(finding.ok for finding in findings) else 1

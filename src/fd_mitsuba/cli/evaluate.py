@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fd_mitsuba.cli.options import machine_options, remark, start
+from fd_mitsuba.cli.options import machine_options, remark, say, start
 from fd_mitsuba.errors import UserError
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     shown = [COLUMNS[name] for name in SHORT]
     Console(width=None if os.isatty(1) else 200).print(rich_table(header(shown), score_rows(results, shown)))
     for line in summary_lines(results):
-        print(line)
+        say(line)
     return 1 if failed else 0
 
 

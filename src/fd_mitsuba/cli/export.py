@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from fd_mitsuba.cli.options import definitions, machine_options, remark, start
+from fd_mitsuba.cli.options import definitions, machine_options, remark, say, start
 
 
 def add_export_commands(commands: argparse._SubParsersAction) -> None:
@@ -75,7 +75,7 @@ def _parts(options: argparse.Namespace) -> int:
     for part in found:
         hidden = "" if part.state == "shown" else f", {part.state}"
         place = run / "export" / "mitsuba" / part.file
-        print(f"{part.name}: round {part.round}, {part.prompt!r}, {part.faces} faces, {place}{hidden}")
+        say(f"{part.name}: round {part.round}, {part.prompt!r}, {part.faces} faces, {place}{hidden}")
     return 0
 
 
@@ -85,7 +85,7 @@ def _render(options: argparse.Namespace) -> int:
 
     settings = (options.views, options.size, options.spp, options.depth)
     for path in render_run(Path(options.run), definitions(options), options.output or "render", *settings, remark):
-        print(path)
+        say(path)
     return 0
 
 
@@ -98,7 +98,7 @@ def _export(options: argparse.Namespace) -> int:
         print(json.dumps(written, indent=2))
         return 0
     for name in written["files"]:
-        print(Path(options.run) / "export" / name)
+        say(Path(options.run) / "export" / name)
     for material, notes in written["notes"].items():
         remark(f"material {material}: {'; '.join(notes)}")
     return 0
@@ -108,5 +108,5 @@ def _instance(options: argparse.Namespace) -> int:
     from fd_mitsuba.export.instances import write_instances
 
     for path in write_instances(Path(options.run), Path(options.transforms), options.output or "instances.xml"):
-        print(path)
+        say(path)
     return 0

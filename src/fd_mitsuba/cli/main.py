@@ -7,6 +7,7 @@ checkpoint first).
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import shlex
 import signal
@@ -21,6 +22,7 @@ from fd_mitsuba.cli.check import add_check_command
 from fd_mitsuba.cli.doctor import add_doctor_command
 from fd_mitsuba.cli.evaluate import add_evaluate_commands
 from fd_mitsuba.cli.export import add_export_commands
+from fd_mitsuba.cli.options import remark
 from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
@@ -35,17 +37,20 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     if own_process:
         _exit_on_signals(options)
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding does not have ends nothing
+                stream.reconfigure(errors="backslashreplace")
     options.command_line = shlex.join(["fd_mitsuba", *arguments])
     verbose = getattr(options, "verbose", False)
     try:
         return options.call(options)
     except Interrupted as stop:
-        print(f"fd_mitsuba: {stop}", file=sys.stderr)
+        remark(str(stop))
         return 130
     except UserError as error:
         if verbose:
             raise
-        print(f"fd_mitsuba: error: {error}", file=sys.stderr)
+        remark(f"error: {error}")
         return 1
     except KeyboardInterrupt:
         print(_interrupted(options), file=sys.stderr)
@@ -53,10 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         if verbose:
             raise
-        print(
-            f"fd_mitsuba: error: {error.filename or 'output'}: {error.strerror or error}; free space or check the path",
-            file=sys.stderr,
-        )
+        remark(f"error: {error.filename or 'output'}: {error.strerror or error}; free space or check the path")
         return 1
 
 

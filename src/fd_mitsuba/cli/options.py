@@ -8,7 +8,7 @@ import sys
 import warnings
 
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, printable
 
 
 def machine_options(parser: argparse.ArgumentParser) -> None:
@@ -20,9 +20,24 @@ def machine_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and library warnings")
 
 
+def say(text: object) -> None:
+    """Print lines to stdout, with nothing in them that a terminal obeys."""
+    print("\n".join(printable(line) for line in str(text).split("\n")))
+
+
 def remark(line: str) -> None:
     """Say something on stderr."""
-    print(f"fd_mitsuba: {line}", file=sys.stderr)
+    print(f"fd_mitsuba: {printable(line)}", file=sys.stderr)
+
+
+def given_text(option: str, value: str) -> str:
+    """The value of an option that is text; UserError where it is not UTF-8, so that no file could hold it."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        problem = "holds bytes that are not UTF-8; give it in the terminal's encoding"
+        raise UserError(f"{option} {value}: {problem}") from None
+    return value
 
 
 def definitions(options: argparse.Namespace) -> dict[str, str]:
@@ -32,7 +47,7 @@ def definitions(options: argparse.Namespace) -> dict[str, str]:
         name, separator, value = item.partition("=")
         if not separator or not name:
             raise UserError(f"-D {item}: write -D name=value")
-        parameters[name] = value
+        parameters[name] = given_text("-D", value)
     return parameters
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import load, scene_options
 from fd_mitsuba.errors import UserError
 
@@ -25,7 +26,7 @@ def _preview(options: argparse.Namespace) -> int:
     name = Path(options.scene).resolve().parent.name
     folder = Path(options.output) if options.output else Path("runs") / f"{name}_preview"
     for path in preview_scene(scene, folder):
-        print(path)
+        say(path)
     if misplaced:
         raise misplaced[0]
     return 0

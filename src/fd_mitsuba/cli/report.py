@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fd_mitsuba.cli.options import remark
+from fd_mitsuba.cli.options import remark, say
 from fd_mitsuba.errors import UserError
 
 
@@ -26,7 +26,7 @@ def _report(options: argparse.Namespace) -> int:
     folders, failed = [Path(run) for run in options.runs], 0
     for folder in folders:
         try:
-            print(write_report(folder))
+            say(write_report(folder))
         except UserError as error:
             if len(folders) == 1:
                 raise
@@ -34,5 +34,5 @@ def _report(options: argparse.Namespace) -> int:
             remark(f"error: {error}")
     if options.gallery:
         # What cannot be shown was said above, and the page says it too.
-        print(write_gallery(folders, Path(options.gallery), options.title, lambda line: None))
+        say(write_gallery(folders, Path(options.gallery), options.title, lambda line: None))
     return 1 if failed else 0

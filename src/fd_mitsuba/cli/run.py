@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fd_mitsuba.cli.options import remark
+from fd_mitsuba.cli.options import remark, say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
 
 
@@ -44,8 +44,8 @@ def _run(options: argparse.Namespace) -> int:
     )
     metrics = run.metrics
     picture = "appearance" if "appearance" in metrics else "turntable"
-    print(f"{run.folder}: part in export/, pictures in images/{picture}.png, all in report.html")
-    print(
+    say(f"{run.folder}: part in export/, pictures in images/{picture}.png, all in report.html")
+    say(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
         f"base identical: {metrics['base_identical']}, {metrics['seconds']:.0f} s"
     )

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fd_mitsuba.cli.options import definitions, machine_options, quiet_libraries
+from fd_mitsuba.cli.options import definitions, given_text, machine_options, quiet_libraries
 from fd_mitsuba.errors import UserError
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] 
     return load_scene(
         options.scene,
         parameters,
-        prompt=options.prompt,
+        prompt=None if options.prompt is None else given_text("--prompt", options.prompt),
         regions=options.regions,
         threads=options.threads,
         variant=options.variant,

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
 PRESETS_FOLDER = Path(__file__).with_name("presets")
 _MOST_BYTES = 1 << 20
@@ -40,21 +41,18 @@ def read_toml(source: str | Path) -> dict[str, Any]:
     """
     path = locate_settings(source)
     try:
-        # A pipe or a device would be read for ever.
-        if path.exists() and not path.is_file():
-            raise UserError(f"{source}: cannot be read (not a file); give a readable TOML file")
-        if path.is_file() and path.stat().st_size > _MOST_BYTES:
-            raise UserError(f"{source}: cannot be read (more than {_MOST_BYTES} bytes); give a TOML file of settings")
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, _MOST_BYTES).decode()
         if number := _TOO_LONG.search(text):
             line = text.count("\n", 0, number.start()) + 1
             raise UserError(f"{source}: line {line}: a number of {len(number[0])} digits; shorten it")
         return tomllib.loads(text)
-    except FileNotFoundError:
-        known = ", ".join(preset_names())
-        raise UserError(f"{source}: no such config file; give one of {known}, or the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{source}: cannot be read ({error}); give a readable TOML file") from None
+    except NotReadable as error:
+        if str(error) == "not found":
+            known = ", ".join(preset_names())
+            raise UserError(f"{source}: no such config file; give one of {known}, or the path of a TOML file") from None
+        raise UserError(f"{source}: {error}; give a readable TOML file") from None
+    except UnicodeDecodeError as error:
+        raise UserError(f"{source}: cannot be read ({error}); save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{source}: not valid TOML ({error}); mend that line") from None
     except RecursionError:
@@ -65,6 +63,8 @@ def apply_override(data: dict[str, Any], item: str) -> str:
     """Write the override's value into `data`; returns its key without blanks."""
     key, separator, text = item.partition("=")
     key, text = key.strip(), text.strip()
+    if not item.isascii() and any("\ud800" <= letter <= "\udfff" for letter in item):
+        raise UserError(f"--set {shortened(item)}: holds bytes that are not UTF-8; give it in the terminal's encoding")
     if not separator or not key:
         raise UserError(f"--set {shortened(item)}: write section.key=value, as in --set geometry.steps=200")
     try:

@@ -14,6 +14,7 @@ from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.judged_views import JudgedViews
 from fd_mitsuba.evaluation.picture_difference import psnr, ssim
+from fd_mitsuba.io.safe_text import safe_file_name, safe_name
 from fd_mitsuba.scene.edit_scene import EditScene, base_elements
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
@@ -94,7 +95,7 @@ def _exported_base(scene: EditScene, exported: Path, copies: dict[Path, Path | N
         if mesh.source_files:
             path = copies[mesh.source_files[0]]
         else:  # an analytic shape is exported as triangles in the user's frame
-            path, plugin, properties, to_world = exported / f"{mesh.name}.ply", "ply", {}, np.eye(4)
+            path, plugin, properties, to_world = exported / safe_name(mesh.name, suffix=".ply"), "ply", {}, np.eye(4)
         if path is None or not path.is_file():
             return None
         try:
@@ -122,7 +123,8 @@ def _pictures(file: SceneFile) -> Iterator[Path]:
 
 def _copy_of(source: Path, folder: Path) -> Path | None:
     """The copy with the source's bytes; else one with its name, maybe after a prefix; None if there is none."""
-    named = sorted(path for path in folder.glob("*") if f"_{path.name}".endswith(f"_{source.name}"))
+    wanted = f"_{safe_file_name(source.name)}"
+    named = sorted(path for path in folder.glob("*") if f"_{path.name}".endswith(wanted))
     return next((path for path in named if _sha(path) == _sha(source)), named[0] if named else None)
 
 

@@ -22,6 +22,7 @@ from fd_mitsuba.export.mitsuba_files import write_mitsuba
 from fd_mitsuba.export.obj import ObjMesh, obj_files
 from fd_mitsuba.export.ready_part import PartAsset, ReadyPart, ready_part
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.safe_text import safe_name
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
 from fd_mitsuba.scene.region_mode import cut_faces_name
@@ -96,7 +97,7 @@ def export_assets(
             write(f"obj/{name}", data)
     if "ply" in formats:
         for name, source in _earlier_files(kept, cut).items():
-            write(f"ply/{name}.ply", source.read_bytes())
+            write(f"ply/{safe_name(name, suffix='.ply')}", source.read_bytes())
         for part in ready:
             write(f"ply/{part.label}.ply", part.ply())
         for name, data in cut.files().items() if cut is not None else ():

@@ -8,8 +8,7 @@ of their own instead, and the shape is left open.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -21,6 +20,7 @@ from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
 from fd_mitsuba.export.mesh_ply import attribute_ply
 from fd_mitsuba.export.solid.cut_base import CutMesh, cut_mesh
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.io.safe_text import safe_name
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.scene_file import SceneFile
@@ -54,8 +54,8 @@ class CutBase:
         names: dict[int, str | None] = {}
         for i, (shape, is_cut) in enumerate(zip(self.opened if opened else self.shapes, self.is_cut, strict=True)):
             if is_cut:
-                name = None if shape is None else cut_file(shape.name, "open" if opened else "cut")
-                names[i] = f"{i}_{name}" if name is not None and name in names.values() else name
+                taken = [name for name in names.values() if name is not None]
+                names[i] = None if shape is None else cut_file(shape.name, "open" if opened else "cut", taken)
         return names
 
     def files(self, opened: bool = False) -> dict[str, bytes]:
@@ -68,9 +68,9 @@ class CutBase:
         }
 
 
-def cut_file(name: str, start: str = "cut") -> str:
-    """The file name of a cut shape's mesh."""
-    return f"{start}_" + re.sub(r"[^\w.-]", "_", name) + ".ply"
+def cut_file(name: str, start: str = "cut", taken: Collection[str] = ()) -> str:
+    """The file name of a cut shape's mesh, one that is not taken."""
+    return safe_name(f"{start}_{name}", taken, ".ply")
 
 
 def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> CutBase:

@@ -29,9 +29,11 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instance_glb import instance_glb
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import read_json_object
+from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
 _KEYS = {"part", "to_world", "position", "direction", "twist_deg", "scale", "base"}
 MOST_PLACEMENTS = 100_000
+_MOST_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -112,11 +114,9 @@ def read_placements(path: Path, record: dict[str, Any]) -> list[Placement]:
         UserError: an unreadable file, or an entry that does not say where which part goes.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path}: cannot be read (not a file); give a JSON list of placements")
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); give a JSON list of placements") from None
+        entries = json.loads(read_regular(path, _MOST_BYTES))
+    except NotReadable as error:
+        raise UserError(f"{path}: {error}; give a JSON list of placements") from None
     except RecursionError:
         raise UserError(f"{path}: not a list of placements (nested too deep); write [{{...}}, ...]") from None
     except ValueError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.ply import ply_bytes
+from fd_mitsuba.io.safe_text import safe_file_name
 from fd_mitsuba.scene.edit_scene import EditScene
 
 
@@ -60,6 +60,6 @@ def copy_base(scene: EditScene, folder: Path, textures: Sequence[Path] = ()) -> 
 def _free_name(wanted: str, prefix: str, taken: set[str]) -> str:
     """`wanted`, or with the prefix and a number where that is taken; without what cannot be in a file name."""
     candidates = itertools.chain([wanted, f"{prefix}_{wanted}"], (f"{prefix}_{i}_{wanted}" for i in itertools.count(2)))
-    name = next(name for name in (re.sub(r"[^\w.-]", "_", c) for c in candidates) if name not in taken)
+    name = next(safe_file_name(c) for c in candidates if safe_file_name(c) == safe_file_name(c, taken))
     taken.add(name)
     return name

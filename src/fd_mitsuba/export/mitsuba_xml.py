@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -12,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.safe_text import safe_file_name
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import ANALYTIC
 from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION
 from fd_mitsuba.scene.scene_file import SceneFile
+from fd_mitsuba.scene.xml_element import XmlElement
 
 FILES = "files"
 """Folder beside the scene that holds what it reads."""
@@ -60,9 +60,6 @@ def mitsuba_scene(
         cut: number of a base shape -> the PLY in the folder `FILES` that takes the place of its file, as after a cut;
             None: nothing is left of it.
         without: ids of shapes to leave out.
-
-    Raises:
-        UserError: XML that only Mitsuba's own parser reads.
     """
     own = {
         name for part in parts for name in [part.ply, part.normal_map, *(pair[0] for pair in part.textures.values())]
@@ -74,7 +71,7 @@ def mitsuba_scene(
     names = _Names(file, own)
     root = ET.Element("scene", {"version": "3.0.0"})
     for element in _elements(file):
-        if element.tag in ("default", "path") or element.get("type") in (FOCAL_REGION, DUAL_PATH):
+        if element.get("type") in (FOCAL_REGION, DUAL_PATH):
             continue
         if _is_part_bsdf(element):
             continue
@@ -102,6 +99,9 @@ def mitsuba_scene(
     part_bsdf.attrib.pop("id", None)
     for part in parts:
         root.append(_part(part, part_bsdf))
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            element.set(key, value.replace("$", "\\$"))  # it would be a parameter to whoever reads the exported scene
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n", names.copies
 
@@ -111,35 +111,14 @@ def _is_part_bsdf(element: ET.Element) -> bool:
 
 
 def _elements(file: SceneFile) -> list[ET.Element]:
-    return _read(file.path, {**file.text.defaults, **file.parameters})
+    """The elements below `<scene>` as the scene was read: names filled in, includes in place, spectra as values."""
+    return [_copied(child) for child in file.text.root.children]
 
 
-def _read(path: Path, known: dict[str, str]) -> list[ET.Element]:
-    """The elements below `<scene>`, with `$names` filled in and includes in their place."""
-    try:
-        root = ET.fromstring(path.read_bytes())
-    except ET.ParseError as error:
-        raise UserError(f"{path}: is not strict XML ({error}); mend it to export the scene") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read any more ({error.strerror}); put the file back") from None
-    longest = sorted(known, key=len, reverse=True)
-    pattern = re.compile(r"\\\$|\$(" + "|".join(map(re.escape, longest)) + ")") if longest else re.compile(r"\\\$")
-
-    def filled(match: re.Match[str]) -> str:
-        return known[match.group(1)] if match.lastindex else "$"
-
-    found: list[ET.Element] = []
-    for element in root:
-        for inner in element.iter():
-            inner.tail = None
-            inner.text = None
-            for key, value in inner.attrib.items():
-                inner.set(key, pattern.sub(filled, value))
-        if element.tag == "include":
-            found += _read(path.parent / element.get("filename", ""), known)
-        else:
-            found.append(element)
-    return found
+def _copied(element: XmlElement) -> ET.Element:
+    copied = ET.Element(element.tag, element.attributes)
+    copied.extend(_copied(child) for child in element.children)
+    return copied
 
 
 class _Names:
@@ -154,17 +133,13 @@ class _Names:
         for inner in element.iter():
             if inner.tag == "string" and inner.get("name") == "filename" and inner.get("value") != but:
                 inner.set("value", self._copy(inner.get("value", "")))
-            elif inner.tag == "spectrum" and inner.get("filename"):
-                inner.set("filename", self._copy(inner.get("filename", "")))
 
     def _copy(self, name: str) -> str:
         source = self.file.resolve(name).resolve()
-        stem, suffix = re.sub(r"[^\w.-]", "_", source.stem), source.suffix
-        number, new = 1, f"{stem}{suffix}"
-        while new in self.taken or self.copies.get(new, source) != source:
-            number += 1
-            new = f"{stem}_{number}{suffix}"
-        self.copies[new] = source
+        new = next((known for known, original in self.copies.items() if original == source), None)
+        if new is None:
+            new = safe_file_name(source.name, {*self.taken, *self.copies})
+            self.copies[new] = source
         return f"{FILES}/{new}"
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture, srgb_from_linear
 from fd_mitsuba.io.float_steps import is_coarse
+from fd_mitsuba.io.safe_text import safe_name
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class ObjMesh:
     """A group of an OBJ file, in the user frame.
 
     Attributes:
-        name: of object, group and material.
+        name: of object, group and material, after `safe_name`.
         vertices: (V, 3).
         faces: (F, 3).
         normals: (V, 3) unit, None to leave them out.
@@ -38,15 +39,19 @@ class ObjMesh:
 def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:
     """File name -> bytes: the OBJ, its MTL and the pictures. Numbers are exact for float32, or 15 digits.
 
-    Positions have the latter where they lie too far from the origin for float32.
+    Positions have the latter where they lie too far from the origin for float32. All names in it, and of the files, are
+    of letters, digits, `_`, `.` and `-`, and differ where case does not count.
     """
     files: dict[str, bytes] = {}
     lines = [f"mtllib {name}.mtl"]
     materials: list[str] = []
+    labels: list[str] = []
     positions = places = directions = 0
     for mesh in meshes:
-        materials += _material_lines(mesh.name, mesh.material, files)
-        lines += [f"o {mesh.name}", f"g {mesh.name}", f"usemtl {mesh.name}"]
+        label = safe_name(mesh.name, labels)  # a blank would end it, and make two groups of one
+        labels.append(label)
+        materials += _material_lines(label, mesh.material, files)
+        lines += [f"o {label}", f"g {label}", f"usemtl {label}"]
         far = is_coarse(mesh.vertices)
         rows = np.asarray(mesh.vertices, dtype=np.float64 if far else np.float32)
         if mesh.colours is not None:
@@ -128,5 +133,9 @@ def _options(picture: Picture) -> str:
 
 
 def _put(files: dict[str, bytes], picture: Picture) -> str:
-    files[picture.file_name] = picture.data
-    return picture.file_name
+    """The name that the picture got: one that is free, or its own where it is there already."""
+    name = safe_name(picture.name, suffix=picture.suffix)
+    if files.get(name) != picture.data:
+        name = safe_name(picture.name, files, picture.suffix)
+    files[name] = picture.data
+    return name

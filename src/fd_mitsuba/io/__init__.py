@@ -1,0 +1,1 @@
+"""Files and names, with nothing in it that knows of 3D editing."""

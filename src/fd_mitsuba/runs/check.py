@@ -10,7 +10,7 @@ import numpy as np
 
 from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, printable
 from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
@@ -107,7 +107,7 @@ class CheckReport:
             lines.append(f"         material: about {step} s a step, {whole} in all")
         lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
         lines += [f"warning  {warning}" for warning in self.warnings] or ["ok       nothing to warn of"]
-        return lines
+        return [printable(line) for line in lines]
 
 
 def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:

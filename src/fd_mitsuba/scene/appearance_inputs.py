@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fd_mitsuba.backend.file_threads import file_threads
+from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS
 from fd_mitsuba.backend.startup import NORMALS, UVS, VERTICES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.base_appearance import base_shapes
@@ -87,7 +88,7 @@ def _check_picture(file: SceneFile, element: SceneElement, warnings: list[str]) 
     try:
         with file_threads():
             values = np.array(file.mi.Bitmap(str(file.resolve(name))))
-    except RuntimeError as error:
+    except MITSUBA_ERRORS as error:
         raise element.error(f"{name}: {file.translated(error)}; save the picture anew") from None
     if values.dtype.kind == "f":
         broken = int(np.sum(~np.isfinite(values)))

@@ -10,17 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import is_coarse, size_problem
 from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
+from fd_mitsuba.scene.file_gate import mark_sound
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
+from fd_mitsuba.scene.mesh_source import FILE_SHAPES, BrokenMesh, NotAMesh, shape_triangles
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
@@ -226,19 +228,22 @@ def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> 
         with file.searching():
             if element.plugin == FOCAL_REGION:
                 return region_triangles(file.mi, plain.get("filename"), to_world)
-            return shape_triangles(file.mi, element.plugin, plain, to_world)
+            triangles = shape_triangles(file.mi, element.plugin, plain, to_world)
+            if element.plugin in FILE_SHAPES.values():
+                mark_sound(file, element)
+            return triangles
     except NotAMesh:
         raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None
     except BrokenMesh as error:
         fault = mesh_fault(file.resolve(filename)) if filename else None
         raise element.error(f"{subject}{fault or f'{error}; repair the mesh and save it anew'}") from None
-    except ValueError as error:
-        raise element.error(f"{error}; save it as one of these") from None
-    except RuntimeError as error:
+    except MITSUBA_ERRORS as error:
         if filename and (fault := mesh_fault(file.resolve(filename))):
             raise element.error(f"{subject}{fault}") from None
         problem = str(file.translated(error)).removeprefix(f"{file.path}: ")
         raise element.error(f"{subject}{problem}") from None
+    except ValueError as error:
+        raise element.error(f"{error}; save it as one of these") from None
 
 
 def _base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:

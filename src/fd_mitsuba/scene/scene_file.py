@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,17 +13,17 @@ from typing import Any
 
 from fd_mitsuba.backend import startup
 from fd_mitsuba.backend.file_threads import file_threads
-from fd_mitsuba.backend.parser_message import one_line
+from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS, one_line
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.file_faults import fault_of_file
+from fd_mitsuba.scene.file_gate import check_meshes, opened_files, refuse_incomplete
 from fd_mitsuba.scene.mesh_numbers import correct_mesh
 from fd_mitsuba.scene.mitsuba_warnings import mitsuba_warnings
+from fd_mitsuba.scene.normalised_xml import normalise
 from fd_mitsuba.scene.plugins import register
+from fd_mitsuba.scene.property_types import refuse_wrong_types
 from fd_mitsuba.scene.scene_copy import copied_files
-from fd_mitsuba.scene.xml_guard import refuse_plugin_path, scan_scene
-
-MAX_OBJECT_NESTING = 16
-"""Nested objects that Mitsuba walks in exponential time, such as a `twosided` in a `twosided`, stay below this."""
+from fd_mitsuba.scene.xml_guard import scan_scene
 
 
 def ready_mitsuba() -> Any:
@@ -78,29 +80,32 @@ class SceneFile:
         parameters: values for `$name`; a `$` within a value is literal.
 
     Attributes:
+        text: what the file says, names filled in and includes in place.
+        elements: its objects, in file order.
+        files: every file that it names, meshes, images, spectra and so on: name -> the file.
         warnings: of the last `instantiate`, a line each: what Mitsuba warned of, numbers of meshes that were mended.
 
     Raises:
-        UserError: whatever `xml_guard.scan_scene` refuses; XML or references that Mitsuba cannot read; an undefined
-            `$name`; a plugin type that is a path; objects nested too deep; a file that the scene names but that is
-            not there.
+        UserError: whatever `xml_guard.scan_scene` refuses; elements, properties or references that Mitsuba cannot read;
+            a property of the wrong type; a file that the scene names, but that is missing or refused by `file_gate`.
     """
 
     def __init__(self, path: Path | str, parameters: dict[str, str] | None = None) -> None:
         self.path = Path(path)
         self.parameters = dict(parameters or {})
         self.warnings: tuple[str, ...] = ()
-        self.text = scan_scene(self.path, self.parameters)
-        self.mi = ready_mitsuba()
         self._copied = copied_files(self.path)
-        self._described: dict[tuple[int, int], str] = {}
+        self.text = scan_scene(self.path, self.parameters)
+        self._xml = normalise(self.text.root)
+        self._line_starts = [0, *(match.end() for match in re.finditer(b"\n", self._xml.text.encode()))]
+        self.mi = ready_mitsuba()
         self._resolver = self._own_resolver()
         with self.searching():
-            state = self._parse()
-            self._resolver = self.mi.file_resolver()  # parsing a <path> adds to it
-            self.elements = tuple(self._elements(state))
-            self._refuse_deep_nesting(state)
-            self.files = self._referenced_files()
+            self.elements = tuple(self._elements(self._parse()))
+            refuse_incomplete(self.elements)
+            self.files = self.text.spectra | opened_files(
+                self.elements, self.mi.file_resolver(), self.path.parent, self._copied
+            )
 
     def top_level(self, kind: str) -> list[SceneElement]:
         """The elements of one kind directly below `<scene>`, in file order."""
@@ -113,9 +118,10 @@ class SceneFile:
             without: top-level objects to leave out, by kind or plugin type, such as ("focal_region", "sensor").
 
         Raises:
-            UserError: a plugin that fails, is unknown, or does not know a property.
+            UserError: a mesh that would break Mitsuba; a plugin that fails, is unknown, or does not know a property.
         """
         with self.searching():
+            check_meshes(self)
             state = self._parse()
             if without:
                 self._drop(state, without)
@@ -123,7 +129,7 @@ class SceneFile:
             try:
                 with file_threads(), mitsuba_warnings(self.mi) as said:
                     scene = self.mi.parser.instantiate(self._config(), state)
-            except RuntimeError as error:
+            except MITSUBA_ERRORS as error:
                 raise (fault_of_file(self, error) or self.translated(error)) from None
             scene = scene[0] if isinstance(scene, list) else scene
             kept = [shape for shape in self.top_level("shape") if not {shape.kind, shape.plugin} & set(without)]
@@ -164,12 +170,13 @@ class SceneFile:
 
     def translated(self, error: BaseException) -> UserError:
         """A RuntimeError of Mitsuba as one line about this scene."""
-        return UserError(one_line(error, self.path, self._describe, self.mi))
+        return UserError(one_line(error, self.path, self._xml.place, self.mi))
 
     def _own_resolver(self) -> Any:
         resolver = self.mi.FileResolver()
         resolver.clear()
-        resolver.append(str(self.path.resolve().parent))
+        for folder in (*self.text.paths, self.path.resolve().parent):
+            resolver.append(str(folder))
         for entry in self.mi.file_resolver():
             resolver.append(entry)
         return resolver
@@ -184,52 +191,34 @@ class SceneFile:
 
     def _parse(self) -> Any:
         parser = self.mi.parser
-        literal = {name: value.replace("$", "\\$") for name, value in self.parameters.items()}
         config = self._config()
         try:
-            state = parser.parse_file(config, str(self.path), **literal)
-            for node in state.nodes:
-                file, line, column = self._location(state, node)
-                if file == str(self.path):
-                    self._described[line, column] = _tag(_kind(node), node.props.plugin_name(), node.props.id())
+            state = parser.parse_string(config, self._xml.text)
             parser.transform_all(config, state)
-        except RuntimeError as error:
+        except MITSUBA_ERRORS as error:
             raise self.translated(error) from None
         return state
 
     def _elements(self, state: Any) -> Iterator[SceneElement]:
-        folder = self.path.resolve().parent
-        for file in state.files:
-            if not Path(str(file)).resolve().is_relative_to(folder):
-                raise UserError(f"{self.path}: <include>: {file} lies outside the scene's folder; move it there")
         types = self.mi.Properties.Type
         children = {self._index(state.root.props, key) for key in self._links(state.root.props)}
         for number, node in enumerate(state.nodes):
             if number == 0:
                 continue
-            file, line, _ = self._location(state, node)
             links = (types.Reference, types.ResolvedReference, types.Object)
-            properties = {key: node.props[key] for key in node.props.keys() if node.props.type(key) not in links}
+            plain = [key for key in node.props.keys() if node.props.type(key) not in links]
             element = SceneElement(
                 kind=_kind(node),
                 plugin=node.props.plugin_name(),
                 id=node.props.id(),
                 top_level=number in children,
-                where=f"{file or self.path}:{line}",
-                properties=properties,
+                where=self._xml.place(bisect_right(self._line_starts, node.offset))[0] or str(self.path),
+                properties={key: node.props[key] for key in plain},
                 # Node 0 is the scene itself, which is no element.
                 children={key: self._index(node.props, key) - 1 for key in self._links(node.props)},
             )
-            refuse_plugin_path(f"{element.where}: <{element.kind}>", element.plugin)
+            refuse_wrong_types(element, {key: node.props.type(key) for key in node.props.keys()}, types)
             yield element
-
-    def _location(self, state: Any, node: Any) -> tuple[str, int, int]:
-        file, _, rest = self.mi.parser.file_location(state, node).rpartition(" (line ")
-        line, _, column = rest.rstrip(")").partition(", col ")
-        return (file, int(line), int(column)) if column else (str(self.path), 0, 0)
-
-    def _describe(self, line: int, column: int) -> str:
-        return self._described.get((line, column), "")
 
     def _links(self, properties: Any) -> list[str]:
         resolved = self.mi.Properties.Type.ResolvedReference
@@ -237,34 +226,6 @@ class SceneFile:
 
     def _index(self, properties: Any, key: str) -> int:
         return properties[key].index()
-
-    def _refuse_deep_nesting(self, state: Any) -> None:
-        depth: dict[int, int] = {}
-
-        def depth_of(number: int) -> int:
-            if number not in depth:
-                properties = state.nodes[number].props
-                below = [depth_of(self._index(properties, key)) for key in self._links(properties)]
-                depth[number] = 1 + max(below, default=0)
-            return depth[number]
-
-        for number, element in enumerate(self.elements, start=1):
-            if depth_of(number) > MAX_OBJECT_NESTING:
-                raise element.error(f"objects are nested deeper than {MAX_OBJECT_NESTING}; flatten them")
-
-    def _referenced_files(self) -> dict[str, Path]:
-        files = {}
-        resolver = self.mi.file_resolver()
-        for element in self.elements:
-            name = element.properties.get("filename")
-            if not isinstance(name, str):
-                continue
-            target = self._copied.get(name) or Path(str(resolver.resolve(name)))
-            if not target.is_file():
-                kind = "is a folder" if target.is_dir() else f"not found (looked in {self.path.parent})"
-                raise element.error(f"file {name!r} {kind}; correct the file name")
-            files[name] = target
-        return files
 
     def _find_copies(self, state: Any) -> None:
         """Let Mitsuba read what a copied scene keeps in another place than the name says."""

@@ -15,6 +15,7 @@ from fd_mitsuba.evaluation.report.run_page import PAGE, page_template, turntable
 from fd_mitsuba.evaluation.report.run_record import RunRecord, read_run
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.safe_text import quoted_link
 from fd_mitsuba.viewing.film_strip import Strip, common_crop, strip
 
 _THUMB_FRAMES, _THUMB_SIZE = 12, 160
@@ -125,13 +126,13 @@ def write_gallery(
         means=_means(columns, rows) if len(rows) > 1 else None,
         judges=judges,
     )
-    write_atomically(path, text.encode())
+    write_atomically(path, text.encode(errors="backslashreplace"))
     return path
 
 
 def _row(run: RunRecord, columns: Sequence[_Column], root: Path) -> GalleryRow:
     report = run.folder / "report.html"
-    link = Path(os.path.relpath(report.resolve(), root)).as_posix() if report.is_file() else None
+    link = quoted_link(Path(os.path.relpath(report.resolve(), root))) if report.is_file() else None
     before, after = _thumbs(run.folder)
     values = [column.value(run) for column in columns]
     cells = [

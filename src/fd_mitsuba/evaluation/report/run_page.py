@@ -56,7 +56,7 @@ def write_report(folder: Path) -> Path:
         about = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise UserError(f"{folder}: cannot be shown ({about}); a file in it was damaged") from error
     path = folder / "report.html"
-    write_atomically(path, text.encode())
+    write_atomically(path, text.encode(errors="backslashreplace"))
     return path
 
 

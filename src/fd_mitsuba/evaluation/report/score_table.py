@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rich.table import Table
+from rich.text import Text
 
+from fd_mitsuba.errors import printable
 from fd_mitsuba.evaluation.picture_difference import MOST_DECIBELS
 
 Number = float | None
@@ -145,7 +147,7 @@ def rich_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str 
     for name in header:
         table.add_column(name, justify="left" if name in ("scene", "judge", "run") else "right", overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(printable(cell)) for cell in row))
     return table
 
 
