@@ -76,6 +76,7 @@ def edit(
     quiet: bool = False,
     stages: Collection[str] = STAGES,
     geometry_from: Path | str | None = None,
+    tries: int | None = None,
     say: Callable[[str], None] | None = None,
     command: str = "",
 ) -> Run:
@@ -92,6 +93,7 @@ def edit(
         quiet: no progress display, no remarks.
         stages: which of `geometry` and `appearance` to run.
         geometry_from: another run of this scene, whose finished geometry is taken over.
+        tries: grow up to so many seeds and keep the one that looks most like the prompt; see `evaluation.tries`.
         say: takes remarks, a line each; None: they go to stderr unless `quiet`.
         command: for the record in the run folder.
 
@@ -114,15 +116,27 @@ def edit(
     if guidance is None:
         opening += [f"warning: {line}" for line in misfits(config)]
     from fd_mitsuba.evaluation.report.run_page import reported
+    from fd_mitsuba.evaluation.tries import run_tries
+    from fd_mitsuba.evaluation.verdict import judge_run
     from fd_mitsuba.runs.pipeline import run
 
     folder = Path(output)
     taken = None if geometry_from is None else Path(geometry_from)
+    if tries is not None and (taken, guidance, on_step) != (None, None, None):
+        raise UserError("tries: grows shapes of its own; leave out the other run, and guidance and on_step")
     with reported(folder, say):
-        run(scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step, opening)
+        if tries is not None:
+            run_tries(scene, config, folder, tries, resume, command, quiet, say, tuple(stages), opening)
+        else:
+            run(
+                scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step, opening,
+                judge=judge_run,
+            )  # fmt: skip
     result = Run(folder)
+    said = result.metrics.get("verdict", {}).get("line")
     for warning in result.warnings:
-        say(f"warning: {warning}")
+        if warning != said:
+            say(f"warning: {warning}")
     return result
 
 

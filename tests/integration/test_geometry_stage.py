@@ -93,6 +93,36 @@ def test_same_seed_same_field(stage: Callable[..., GeometryStage]) -> None:
         assert torch.equal(one, other)
 
 
+class Listening(PullMask):
+    """Keeps what it is shown."""
+
+    def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: str, seed: int) -> GuidanceResult:
+        self.seen = (tuple(map(float, views.azimuth_deg)), seed, views.pictures.detach().clone())
+        return super().guide(views, step, steps_total, phase, seed)
+
+
+def test_the_seed_reaches_start_field_cameras_and_guidance(make_scene: Callable[..., Path]) -> None:
+    scene, seen, stages = load_edit_scene(make_scene()), [], []
+    for seed in (0, 1, 2):
+        config = settings(start_variety=0.6).model_copy(update={"seed": seed})
+        stages.append(GeometryStage(scene, config, Listening(+1.0)))
+        stages[-1].step(0)
+        seen.append(stages[-1].guidance.seen)
+    azimuths, noise, pictures = zip(*seen, strict=True)
+    assert len(set(azimuths)) == len(set(noise)) == 3
+    starts = [stage.start_sdf > 0 for stage in stages]
+    assert torch.equal(starts[0], stages[0].region_sdf > 0)  # seed 0 is the region as it was drawn
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        overlap = (starts[one] & starts[other]).sum() / (starts[one] | starts[other]).sum()
+        assert overlap < 0.9
+        assert not torch.equal(pictures[one], pictures[other])
+        assert not torch.equal(stages[one].field.grid.table, stages[other].field.grid.table)
+    # What no picture guides, and what is cut, starts as the artist drew it.
+    unguided = settings(start_variety=0.6, lambda_sds=0.0).model_copy(update={"seed": 1})
+    stage = GeometryStage(scene, unguided, None)
+    assert torch.equal(stage.start_sdf, stage.region_sdf)
+
+
 def test_a_part_that_vanishes_stops_the_run(stage: Callable[..., GeometryStage]) -> None:
     shrinker = stage(-1.0, learning_rate=5e-2, lambda_focal=0.0)
     with pytest.raises(RunStopped, match="vanished|invisible|exploded"):

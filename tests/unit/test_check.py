@@ -9,11 +9,13 @@ import pytest
 from conftest import BASE, write_ply
 from PIL import Image
 
+from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import working_set_bytes
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.cost import LIT_PICTURES_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
+from fd_mitsuba.runs.geometry_outcome import prepare_geometry
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.viewing.preview import preview_scene, region_colours
 
@@ -105,6 +107,44 @@ def test_scene_level_warnings(make_scene: Make) -> None:
         )
     )
     assert "no emitter" in text and "base_prompt" in text
+
+
+def _with_prompt(prompt: str) -> str:
+    return f'<integrator type="dual_path"><string name="prompt" value="{prompt}"/></integrator>'
+
+
+def test_the_prompt_is_read_as_a_run_reads_it(make_scene: Make) -> None:
+    scene = load_edit_scene(make_scene(integrator=_with_prompt("a cuddly rabbit with a wizard's hat")))
+    report = check_scene(scene, RunConfig())
+    assert "read as  part: pointed hat; body: rabbit; ignored: cuddly" in report.lines() and report.refusal is None
+    assert json.loads(json.dumps(report.to_json()))["prompt_reading"]["caption"] == "a rabbit with a wizard hat"
+    heard: list[str] = []
+    prepare_geometry(scene, RunConfig(), heard.append)
+    assert heard == ["prompt read as part: pointed hat; body: rabbit; ignored: cuddly"]
+    for settings in (["geometry.lambda_sds=0", "appearance.lambda_sds=0"], ["guidance.model=owner/stable-diffusion"]):
+        assert check_scene(scene, RunConfig.load(None, settings)).prompt_reading is None
+
+
+@pytest.mark.parametrize("prompt", ["a pig", "a pig without wings", "a pig with a jetpack", "a pig with a scarf"])
+def test_a_prompt_that_a_run_refuses_is_refused(
+    make_scene: Make, prompt: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make_scene(integrator=_with_prompt(prompt))
+    with pytest.raises(UserError) as refused:
+        prepare_geometry(load_edit_scene(path), RunConfig(), lambda line: None)
+    assert main(["check", str(path)]) == 1
+    told = capsys.readouterr()
+    assert (
+        told.err == f"fd_mitsuba: error: {refused.value}\n" and "cost" in told.out and "nothing to warn" not in told.out
+    )
+    assert ("subtract" in told.err) == ("without" in prompt)
+
+
+def test_a_cut_that_a_run_refuses_is_refused(make_scene: Make) -> None:
+    cut = ball("0.15", 0, 0.3, 0).replace("<transform", '<string name="mode" value="subtract"/><transform')
+    scene = load_edit_scene(make_scene(region=cut))
+    assert "subtract" in (check_scene(scene, RunConfig()).refusal or "")
+    assert check_scene(scene, RunConfig.load(None, ["geometry.lambda_sds=0"])).refusal is None
 
 
 def test_a_material_that_cannot_be_learned_is_told(make_scene: Make) -> None:

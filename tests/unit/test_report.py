@@ -84,6 +84,26 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+def test_the_verdict_and_the_tried_seeds_are_shown(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    assert not any(attributes.get("id") in ("verdict", "tries") for _, attributes in Page(write_report(folder)).tags)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    verdict = {"line": "does NOT look like <glasses>", "looks_like": False}
+    (folder / "metrics.json").write_text(json.dumps({**metrics, "verdict": verdict}))
+    make_run(folder / "tries" / "seed_4", ("geometry",))
+    (folder / "tries" / "seed_4" / "report.html").write_text("x")
+    tries = [{"seed": seed, "folder": f"tries/seed_{seed}", "line": f"line of {seed}"} for seed in (3, 4)]
+    (folder / "tries.json").write_text(json.dumps({"taken": 4, "tries": [*tries, "damaged"]}))
+    page = Page(write_report(folder))
+    (chip,) = [attributes for _, attributes in page.tags if attributes.get("id") == "verdict"]
+    assert chip["class"] == "bad" and "does NOT look like <glasses>" in page.text
+    assert "seed 4, taken" in page.text and "seed 3: line of 3" in page.text and "line of 4" in page.text
+    assert [attributes["href"] for tag, attributes in page.tags if tag == "a"] == ["tries/seed_4/report.html"]
+    pictures = [attributes for tag, attributes in page.tags if tag == "img" and attributes["alt"].startswith("seed")]
+    assert [picture["alt"] for picture in pictures] == ["seed 4, taken"]  # the other seed left no picture
+    assert pictures[0]["src"].startswith("data:image/webp")
+
+
 def test_the_page_holds_everything_itself(finished: Path) -> None:
     path = finished / "report.html"
     page = Page(path)

@@ -7,6 +7,7 @@ import json
 
 from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
+from fd_mitsuba.errors import UserError
 
 
 def add_check_command(commands: argparse._SubParsersAction) -> None:
@@ -26,8 +27,10 @@ def _check(options: argparse.Namespace) -> int:
     report = check_scene(scene, settings.config)
     if options.json:
         print(json.dumps(report.to_json(), indent=2))
-        return 0
-    if settings.remark:
-        say(settings.remark.replace(": ", " ", 1))
-    say("\n".join(report.lines()))
+    else:
+        if settings.remark:
+            say(settings.remark.replace(": ", " ", 1))
+        say("\n".join(report.lines()))
+    if report.refusal is not None:
+        raise UserError(report.refusal)
     return 0

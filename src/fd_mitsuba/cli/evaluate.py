@@ -147,8 +147,8 @@ def _as_given(options: argparse.Namespace) -> list[str]:
 def _readable_scenes(options: argparse.Namespace, shipped: list[ScenePrompts]) -> list[Path]:
     """The shipped scenes that the settings' guidance model can read; a remark says why the others are left out."""
     from fd_mitsuba.config import RunConfig
-    from fd_mitsuba.evaluation.run_evaluation import vocabulary_of
-    from fd_mitsuba.guidance.vocabulary import read_prompt
+    from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
+    from fd_mitsuba.guidance.prompt_reader import read_prompt
 
     model = RunConfig.load(Path(options.config), options.overrides).guidance.model
     vocabulary = vocabulary_of(model)

@@ -21,6 +21,9 @@ def add_run_command(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--from", dest="geometry_from", metavar="RUN", help="take the finished geometry of another run of this scene"
     )
+    run.add_argument(
+        "--tries", type=int, metavar="N", help="grow up to N seeds, keep the one that looks most like the prompt"
+    )
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run in the output folder")
     run.add_argument("-q", "--quiet", action="store_true", help="no progress display")
     run.set_defaults(call=_run, resumable=True)
@@ -39,6 +42,7 @@ def _run(options: argparse.Namespace) -> int:
         quiet=options.quiet,
         stages=STAGES if options.stage == "all" else (options.stage,),
         geometry_from=options.geometry_from,
+        tries=options.tries,
         say=remark,
         command=options.command_line,
     )

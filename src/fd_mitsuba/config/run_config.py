@@ -25,7 +25,7 @@ from fd_mitsuba.config.sections import (
 from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml, shortened
 from fd_mitsuba.errors import UserError
 
-_NEWER = {"geometry.lambda_tether": 0.0}
+_NEWER = {"geometry.lambda_tether": 0.0, "geometry.start_variety": 0.0}
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
 

@@ -79,6 +79,8 @@ class GeometryConfig(Section):
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
     union_k: Length = 0.15
     union_only_outside: bool = False
+    start_variety: Fraction = 0.0
+    """How much seeds other than 0 vary what the part starts as, within its regions; not in the paper."""
     lambda_sds: Weight = 1.0
     lambda_focal: Weight = 1000.0
     focal_sigma_distance: Width = 0.05

@@ -110,6 +110,11 @@ class ClipJudge:
         with network_threads():
             return _pooled(self._model.get_text_features(tokens.input_ids, tokens.attention_mask))
 
+    @property
+    def scale(self) -> float:
+        """What the cosines were multiplied with in its training, before the softmax over texts."""
+        return float(self._model.logit_scale.exp())
+
     def unknown_words(self, text: str) -> list[str]:
         """Words that the model has never seen; always none where it has CLIP's own vocabulary."""
         words = dict.fromkeys(re.findall(r"[^\W\d_]+", text.lower())) if self._whole_words else {}

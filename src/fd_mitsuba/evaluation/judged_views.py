@@ -50,6 +50,16 @@ class JudgedViews:
     untouched: Tensor
 
 
+@dataclass(frozen=True)
+class ShapePictures:
+    """N views of a bare shape: (N, 3, S, S) each, and (N,) how many pixels of the edited one show the part."""
+
+    edited: Tensor
+    base: Tensor
+    start: Tensor
+    part_pixels: Tensor
+
+
 def judged_cameras(count: int, aim: np.ndarray) -> CameraBatch:
     """The evaluation's ring: elevation 45 degrees, evenly spread, front first.
 
@@ -94,17 +104,30 @@ def lit_views(stage: AppearanceStage, count: int, size: int, spp: int) -> Judged
 @torch.no_grad()
 def shape_views(stage: GeometryStage, count: int, size: int, spp: int, kind: Kind) -> JudgedViews:
     """Views of a geometry stage's present shape, without material or light of the scene."""
-    rendering = GeometryPass(size, spp, 0, "camera")
     cameras = judged_cameras(count, stage.aim)
+    shown = _shapes(stage, cameras, size, spp)
+    edited, base = shown["edited"], shown["base"]
+    whole = (edited[:, 3:4] > 0.999) & (base[:, 3:4] > 0.999) & (edited[:, 4:5] == 0)
+    colours = {name: _coloured(picture, kind) for name, picture in shown.items()}
+    return JudgedViews(kind, cameras.azimuth_deg, **colours, base_pixels=whole, untouched=whole)
+
+
+@torch.no_grad()
+def shape_pictures(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int, kind: Kind) -> ShapePictures:
+    """The same from other cameras, for judges alone."""
+    shown = _shapes(stage, cameras, size, spp)
+    colours = {name: _coloured(picture, kind) for name, picture in shown.items()}
+    return ShapePictures(**colours, part_pixels=shown["edited"][:, 4].sum((1, 2)))
+
+
+def _shapes(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int) -> dict[str, Tensor]:
+    rendering = GeometryPass(size, spp, 0, "camera")
 
     def pictures(surface: UnionSurface) -> Tensor:
         return rendering.render_primal(surface.vertices, surface.faces, surface.part_weight, cameras, seed=0)
 
     edited, base, start = map(pictures, (stage.surface(), stage.base_surface, stage.start_surface()))
-    whole = (edited[:, 3:4] > 0.999) & (base[:, 3:4] > 0.999) & (edited[:, 4:5] == 0)
-    shown = {"edited": edited, "base": base, "start": start}
-    colours = {name: _coloured(picture, kind) for name, picture in shown.items()}
-    return JudgedViews(kind, cameras.azimuth_deg, **colours, base_pixels=whole, untouched=whole)
+    return {"edited": edited, "base": base, "start": start}
 
 
 def _coloured(pictures: Tensor, kind: Kind) -> Tensor:

@@ -20,8 +20,7 @@ from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
 from fd_mitsuba.evaluation.similarity import EditPrompt, Judge
-from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
-from fd_mitsuba.guidance.model_conventions import read_model_conventions
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.io.json_object import read_json_object, write_json
 from fd_mitsuba.io.picture import write_picture
@@ -134,12 +133,6 @@ def views_sheet(views: JudgedViews) -> np.ndarray:
 def builtin_vocabulary() -> Vocabulary | None:
     """The words of the built-in prior; None if this installation has none."""
     return vocabulary_of("builtin")
-
-
-def vocabulary_of(model: str) -> Vocabulary | None:
-    """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion."""
-    folder = BUILTIN_FOLDER if model == "builtin" else Path(model)
-    return read_model_conventions(folder).vocabulary if folder.is_dir() else None
 
 
 def _is_whole(known: dict) -> bool:

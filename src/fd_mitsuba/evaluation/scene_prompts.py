@@ -7,7 +7,8 @@ from pathlib import Path
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.similarity import EditPrompt
-from fd_mitsuba.guidance.vocabulary import Vocabulary, read_prompt
+from fd_mitsuba.guidance.prompt_reader import read_prompt
+from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.scene.plugins import DUAL_PATH
 from fd_mitsuba.scene.scene_file import SceneFile
 
@@ -32,9 +33,9 @@ class ScenePrompts:
         return self.scene.resolve().parent.name
 
     def known_to(self, vocabulary: Vocabulary) -> bool:
-        """Whether every word is known, and a body and a part among them."""
+        """Whether every word is one of the vocabulary's own, and a body and a part among them."""
         reading = read_prompt(self.words.prompt, vocabulary)
-        return bool(reading.parts and reading.bodies and not reading.ignored)
+        return bool(reading.parts and reading.bodies) and reading.caption == self.words.prompt.lower()
 
 
 def prompts_of_scenes(folder: Path) -> list[ScenePrompts]:

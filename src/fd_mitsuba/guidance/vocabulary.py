@@ -1,14 +1,9 @@
-"""What a prompt asks of a model that knows a list of words: the parts and bodies it names, the words it ignores."""
+"""The words that a guidance model was trained with, where they can be listed."""
 
 from __future__ import annotations
 
-import difflib
-import re
-from dataclasses import dataclass
-
 from pydantic import BaseModel, ConfigDict
 
-_LINKS = frozenset("a an the with that has wearing on standing riding and of its made two one pair row".split())
 _ARTICLES = ("a pair of ", "a row of ", "a ", "an ", "the ", "one ", "two ")
 
 
@@ -26,58 +21,17 @@ class Vocabulary(BaseModel):
     words: tuple[str, ...] = ()
     """All other words: adjectives, colours, materials, links."""
 
-
-@dataclass(frozen=True)
-class PromptReading:
-    """Attributes:
-    parts: names of the known parts that the prompt asks for; empty if there is none.
-    bodies: names of the known bodies in it.
-    ignored: its words that the model never saw.
-    nearest: known part phrases that are spelt most like the prompt's words, best first.
-    """
-
-    parts: tuple[str, ...]
-    bodies: tuple[str, ...]
-    ignored: tuple[str, ...]
-    nearest: tuple[str, ...]
+    def known_words(self) -> frozenset[str]:
+        """Every single word of the phrases and of `words`."""
+        phrases = (*self.bodies.values(), *self.parts.values(), tuple(self.wholes), self.words)
+        return frozenset(word for group in phrases for phrase in group for word in phrase.split())
 
 
-def read_prompt(prompt: str, vocabulary: Vocabulary) -> PromptReading:
-    """What of `prompt` the vocabulary covers. Case and punctuation do not count."""
-    words = re.findall(r"[^\W\d_]+", prompt.lower())
-    part_phrases = {_bare(phrase): name for name, phrases in vocabulary.parts.items() for phrase in phrases}
-    part_phrases |= vocabulary.wholes
-    body_phrases = {phrase: name for name, phrases in vocabulary.bodies.items() for phrase in phrases}
-    known = {word for phrase in (*part_phrases, *body_phrases, *vocabulary.words) for word in phrase.split()}
-    known |= {word for phrases in vocabulary.parts.values() for phrase in phrases for word in phrase.split()}
-    parts = tuple(dict.fromkeys(name for phrase, name in part_phrases.items() if _occurs(phrase, words)))
-    bodies = tuple(dict.fromkeys(name for phrase, name in body_phrases.items() if _occurs(phrase, words)))
-    ignored = tuple(dict.fromkeys(word for word in words if word not in known))
-    return PromptReading(parts, bodies, ignored, _nearest(words, part_phrases))
+def bare(phrase: str) -> str:
+    """The phrase without its article or number: "a pair of wings" -> "wings"."""
+    return phrase.removeprefix(article_of(phrase))
 
 
-def _bare(phrase: str) -> str:
-    for article in _ARTICLES:
-        if phrase.startswith(article):
-            return phrase.removeprefix(article)
-    return phrase
-
-
-def _occurs(phrase: str, words: list[str]) -> bool:
-    wanted = phrase.split()
-    return any(words[i : i + len(wanted)] == wanted for i in range(len(words) - len(wanted) + 1))
-
-
-def _nearest(words: list[str], phrases: dict[str, str]) -> tuple[str, ...]:
-    """Up to four part phrases that share a word with the prompt or are spelt like one of its words."""
-    asked = [word for word in words if word not in _LINKS]
-    scores = {
-        phrase: max((difflib.SequenceMatcher(None, a, b).ratio() for a in asked for b in _content(phrase)), default=0.0)
-        for phrase in phrases
-    }
-    near = [phrase for phrase in phrases if scores[phrase] > 0.72]
-    return tuple(sorted(near, key=lambda phrase: (-scores[phrase], len(phrase), phrase))[:4])
-
-
-def _content(phrase: str) -> list[str]:
-    return [word for word in phrase.split() if word not in _LINKS]
+def article_of(phrase: str) -> str:
+    """Article or number at the phrase's front with the blank behind it; "" if there is none."""
+    return next((article for article in _ARTICLES if phrase.startswith(article)), "")

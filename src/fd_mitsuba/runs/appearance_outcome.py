@@ -129,7 +129,7 @@ def prepare_appearance(
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
     check_views(AppearanceStage.name, config, guidance)
-    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt, scene.base_prompt)
     return guidance
 
 

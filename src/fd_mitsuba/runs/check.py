@@ -11,6 +11,9 @@ import numpy as np
 from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError, printable
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
+from fd_mitsuba.guidance.prompt_reader import PromptReading
+from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_prompt
 from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
@@ -75,6 +78,10 @@ class CheckReport:
     regions: tuple[RegionCheck, ...]
     cost: CostEstimate
     warnings: tuple[str, ...]
+    prompt_reading: PromptReading | None = None
+    """What the guidance model understands of the prompt; None where it takes any text, or where no model is asked."""
+    refusal: str | None = None
+    """Why a run with these settings would end before its first step; None: it would not."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain dicts, lists, numbers and strings for `json.dumps`, keys as the attributes."""
@@ -83,6 +90,9 @@ class CheckReport:
     def lines(self) -> list[str]:
         """The report as lines for a person, warnings last."""
         lines = [f"scene    {self.scene}", f"prompt   {self.prompt}"]
+        if self.prompt_reading is not None:
+            lines.append(f"read as  {self.prompt_reading.summary()}")
+            lines.append(f"         the prior is told {self.prompt_reading.caption!r}")
         for mesh in self.base:
             found = mesh.topology
             state = _closedness(found)
@@ -106,12 +116,14 @@ class CheckReport:
             step, whole = _number(cost.appearance_seconds_per_step), _duration(cost.appearance_seconds_total)
             lines.append(f"         material: about {step} s a step, {whole} in all")
         lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
-        lines += [f"warning  {warning}" for warning in self.warnings] or ["ok       nothing to warn of"]
+        fine = [] if self.refusal is not None else ["ok       nothing to warn of"]
+        lines += [f"warning  {warning}" for warning in self.warnings] or fine
         return [printable(line) for line in lines]
 
 
 def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
     """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written."""
+    reading, refusal = _prompt(scene, config)
     base = tuple(
         BaseCheck(mesh.name, len(mesh.vertices), len(mesh.faces), mesh.volume(), topology(mesh.vertices, mesh.faces))
         for mesh in scene.base
@@ -141,7 +153,27 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
             + _region_warnings(regions, config)
             + _scene_warnings(scene, config)
         ),
+        prompt_reading=reading,
+        refusal=refusal,
     )
+
+
+def _prompt(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, str | None]:
+    """How the guidance models read the scene's prompt, and why they would refuse it."""
+    by_words = config.appearance.lambda_sds > 0 and scene.has_light and not scene.subtracts
+    asked = {False: config.geometry.lambda_sds > 0, True: by_words}
+    reading = None
+    try:
+        for appearance in (stage for stage, wanted in asked.items() if wanted):
+            if (vocabulary := vocabulary_of(config.guidance.model, appearance)) is None:
+                continue
+            if scene.subtracts:
+                raise cuts_are_unknown(scene.path)
+            found = understood_prompt(scene.prompt, vocabulary, scene.base_prompt)
+            reading = reading or found
+    except UserError as error:
+        return reading, str(error)
+    return reading, None
 
 
 def _closedness(found: Topology) -> str:

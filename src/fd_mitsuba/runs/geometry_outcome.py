@@ -21,6 +21,7 @@ from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.io.ply import ply_bytes
@@ -53,11 +54,8 @@ def prepare_geometry(
         return with_prompt(given, scene, say)
     guidance = DiffusionGuidance.load(config.guidance)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
-        raise UserError(
-            f"{scene.path}: its regions subtract, and the built-in prior knows only parts that are added; set "
-            "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
-        )
-    take_prompt(guidance, scene.prompt, scene.negative_prompt, say)
+        raise cuts_are_unknown(scene.path)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt)
     return guidance
 
 

@@ -37,6 +37,9 @@ def outcome_warnings(metrics: dict[str, Any]) -> list[str]:
     if islands:
         pieces = "a loose piece" if islands == 1 else f"{islands} loose pieces"
         warnings.append(f"{pieces} of the part too small to be meant left out of the export: {_OTHER_SEED}")
+    verdict = metrics.get("verdict")
+    if isinstance(verdict, dict) and not verdict.get("looks_like", True):
+        warnings.append(str(verdict.get("line", "the part does not look like the prompt")))
     if not metrics.get("manifold", True):
         warnings.append("the part's mesh is not a closed manifold: it may fail in booleans and 3D printing")
     return warnings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from fd_mitsuba.backend.peak_memory import peak_memory_mb
 from fd_mitsuba.backend.threads import rendering_threads
@@ -49,6 +49,22 @@ from fd_mitsuba.training.stage import OnStep
 STAGES = ("geometry", "appearance")
 
 
+class SaysWhatItSees(Protocol):
+    """A verdict on a shape: `evaluation.verdict.Verdict` is the one that the package ships."""
+
+    def line(self) -> str:
+        """For people."""
+        ...
+
+    def to_json(self) -> dict[str, Any]:
+        """What `metrics.json` holds."""
+        ...
+
+
+Judge = Callable[[GeometryStage, Callable[[str], None]], SaysWhatItSees | None]
+"""Given a finished stage and where remarks go; None where it cannot say anything."""
+
+
 def run(
     scene: EditScene,
     config: RunConfig,
@@ -62,6 +78,7 @@ def run(
     guidance: Guidance | None = None,
     on_step: OnStep | None = None,
     opening: Sequence[str] = (),
+    judge: Judge | None = None,
 ) -> dict:
     """Grow the part, give it its material, and write the run folder; returns what `metrics.json` holds.
 
@@ -75,6 +92,7 @@ def run(
         guidance: a caller's own, in place of the model that the settings name. The appearance stage takes it too where
             it has `guide_appearance`, and otherwise loads the settings' model.
         on_step: called after each finished step of either stage.
+        judge: says whether the finished shape looks like the prompt; None: nobody does.
         opening: lines for `say` once the input has been found to be good: a refusal stays the only line.
 
     Raises:
@@ -84,7 +102,7 @@ def run(
     refuse_strange_folder(folder)
     with run_lock(folder, say):
         return _run(
-            scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening
+            scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening, judge
         )
 
 
@@ -101,6 +119,7 @@ def _run(
     guidance: Guidance | None,
     on_step: OnStep | None,
     opening: Sequence[str],
+    judge: Judge | None,
 ) -> dict:
     started = time.monotonic()
     for warning in scene.warnings:
@@ -147,6 +166,12 @@ def _run(
         metrics = export_geometry(geometry, folder)
     if guidance is not None:
         metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
+    verdict = None
+    if judge is not None:
+        with rendering_threads():
+            verdict = judge(geometry, say)
+    if verdict is not None:
+        metrics["verdict"] = verdict.to_json()
 
     def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)
@@ -171,6 +196,8 @@ def _run(
     done = {"geometry", *stages}
     metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}
     write_metrics()
+    if verdict is not None:
+        say(verdict.line())
     return metrics
 
 

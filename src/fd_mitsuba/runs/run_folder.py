@@ -29,6 +29,8 @@ from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints
 _IDENTITY_NAME, _SETTINGS_NAME = "run.json", "config.json"
 _FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", "report.html", _IDENTITY_NAME)
 _FOLDERS = ("scene", "images", "checkpoints")
+TRIES_FOLDER, TRIES_RECORD = "tries", "tries.json"
+"""What lies in a run folder before the run itself where several seeds are tried."""
 
 
 def check_folder(scene: EditScene, config: RunConfig, folder: Path, resume: bool) -> list[str]:
@@ -55,7 +57,8 @@ def refuse_strange_folder(folder: Path) -> None:
     """UserError for a file, and for a folder that is neither empty nor a run's."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; choose another -o folder")
-    if not folder.exists() or all(is_litter(path) or path.name == LOCK_NAME for path in folder.iterdir()):
+    before = (LOCK_NAME, TRIES_FOLDER, TRIES_RECORD)
+    if not folder.exists() or all(is_litter(path) or path.name in before for path in folder.iterdir()):
         return
     if not (folder / _IDENTITY_NAME).exists():
         raise UserError(f"{folder}: not empty and not a run; choose another -o folder")

@@ -20,6 +20,7 @@ from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.part_sdf import PartField
+from fd_mitsuba.fields.varied_start import varied_start
 from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -70,6 +71,7 @@ class GeometryStage:
                 f"{scene.path}: no vertex of the grid lies within a focal region; thicken them, or raise "
                 f"geometry.grid_resolution={geometry.grid_resolution}"
             )
+        self.start_sdf = self._start(points, regions)
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.field_losses = FieldLosses(
@@ -117,7 +119,7 @@ class GeometryStage:
         return self.extractor(self.field)
 
     def start_surface(self) -> UnionSurface:
-        """`surface` with the focal regions themselves as the part, without gradients."""
+        """`surface` with what the part starts as, the focal regions or a variation of them, without gradients."""
         with torch.no_grad():
             return self.extractor(PartField(self.config.field.model_copy(update={"offsets": False})))
 
@@ -208,9 +210,18 @@ class GeometryStage:
         geometry = self.config.geometry
         kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
         return kind(
-            self.grid, self.sdf_base, self.region_sdf, active, geometry.union_k, geometry.union_only_outside,
+            self.grid, self.sdf_base, self.start_sdf, active, geometry.union_k, geometry.union_only_outside,
             depth=tether_depth(geometry, self.grid, self.scene.subtracts),
         )  # fmt: skip
+
+    def _start(self, points: np.ndarray, regions: Tensor) -> Tensor:
+        """The part's initial sdf. Seed 0 starts from the regions themselves, and so does whatever nothing guides."""
+        geometry, seed = self.config.geometry, self.config.seed
+        if seed == 0 or geometry.start_variety == 0 or geometry.lambda_sds == 0 or self.scene.subtracts:
+            return self.region_sdf
+        key = seed_for(seed, Purpose.START)
+        varied = [varied_start(region.numpy(), points, geometry.start_variety, key) for region in regions]
+        return torch.from_numpy(np.stack(varied)).amax(dim=0)
 
     def _base_surface(self) -> UnionSurface:
         with torch.no_grad():

@@ -12,12 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
+from PIL import Image
 
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.evaluation.report.curves import stage_curves
 from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
 from fd_mitsuba.evaluation.report.run_record import RunRecord, changed_settings, read_run
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.json_object import read_json_object
+from fd_mitsuba.runs.run_folder import TRIES_RECORD
 from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, read_picture, sheet_row, strip, video_frames
 
 PAGE = Path(__file__).with_name("page")
@@ -33,6 +36,16 @@ class Pair(NamedTuple):
     title: str
     before: Strip
     after: Strip
+
+
+class TriedSeed(NamedTuple):
+    """A seed that was tried: its picture's data URI, what the evaluator said, and the report of its own."""
+
+    title: str
+    line: str
+    taken: bool
+    uri: str | None
+    link: str
 
 
 class Titled(NamedTuple):
@@ -73,6 +86,8 @@ def _page(run: RunRecord) -> str:
         part=None if part is None else strip(part, common_crop(part)),
         part_files=", ".join(f"export/{path.name}" for path in sorted((folder / "export").glob("part_*.ply"))),
         tiles=_tiles(run),
+        verdict=_verdict(run),
+        tries=_tries(folder),
         glb=glb,
         glb_note=glb_note,
         viewer_script=viewer_script(),
@@ -204,6 +219,35 @@ def _tiles(run: RunRecord) -> list[Titled]:
     if spent:
         tiles.append(Titled("in the steps of all stages", text=duration(spent)))
     return tiles
+
+
+def _verdict(run: RunRecord) -> dict | None:
+    """What the evaluator says of the part, where it was asked."""
+    verdict = run.metrics.get("verdict")
+    return verdict if isinstance(verdict, dict) and isinstance(verdict.get("line"), str) else None
+
+
+def _tries(folder: Path) -> list[TriedSeed]:
+    """The seeds of `run --tries`."""
+    record = read_json_object(folder / TRIES_RECORD) or {}
+    tries = record.get("tries")
+    found = []
+    for one in (one for one in tries if isinstance(one, dict)) if isinstance(tries, list) else ():
+        place = str(one.get("folder", ""))
+        frames = sheet_row(folder / place / "images" / "turntable.png", 2)
+        picture = None if frames is None else Image.fromarray(np.concatenate(list(frames[::2]), axis=1))
+        taken = one.get("seed") == record.get("taken")
+        link = f"{place}/report.html" if (folder / place / "report.html").is_file() else ""
+        found.append(
+            TriedSeed(
+                f"seed {one.get('seed')}{', taken' if taken else ''}",
+                str(one.get("line", "")),
+                taken,
+                None if picture is None else picture_uri(picture, 720),
+                link,
+            )
+        )
+    return found
 
 
 def _timings(run: RunRecord) -> dict[str, str]:

@@ -1,0 +1,41 @@
+"""Read a prompt for a model that lists its words, or refuse it in one line that says how to reword it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.prompt_reader import PromptReading, read_prompt
+from fd_mitsuba.guidance.vocabulary import Vocabulary
+
+
+def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> PromptReading:
+    """The reading of a prompt that asks for a part that the model knows.
+
+    Raises:
+        UserError: it asks for none, or only says what shall not be there.
+    """
+    reading = read_prompt(prompt, vocabulary, base_prompt)
+    if reading.parts:
+        return reading
+    if reading.removed and not reading.unknown_parts:
+        off = ", ".join(map(repr, reading.removed))
+        raise UserError(
+            f"prompt {prompt!r}: asks for no part, only for no {off}, and the built-in prior adds; say what shall be "
+            'added, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
+            "geometry.lambda_sds=0"
+        )
+    hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
+    which = f"knows no part {', '.join(map(repr, reading.unknown_parts))}" if reading.unknown_parts else ""
+    raise UserError(
+        f"prompt {prompt!r}: the built-in prior {which or 'knows no such part'}; nearest: {hint}; reword it "
+        "(`fd_mitsuba prior` lists the words), or set guidance.model to a Stable Diffusion folder or hub id"
+    )
+
+
+def cuts_are_unknown(scene: Path) -> UserError:
+    """Why a model that lists its words cannot guide regions that subtract."""
+    return UserError(
+        f"{scene}: its regions subtract, and the built-in prior knows only parts that are added; set "
+        "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
+    )
