@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
-from fd_mitsuba.prior.data.bodies import BODIES
-from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.data.catalogue import COARSE, Catalogue
 from fd_mitsuba.prior.data.primitives import Solid, ellipsoid, join, rotation
 from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, closeup_camera, shade, vertex_normals
 
@@ -40,11 +39,11 @@ class Views:
         return len(self.label)
 
 
-def make_views(body: str, seed: int) -> Views:
+def make_views(body: str, seed: int, catalogue: Catalogue = COARSE) -> Views:
     """Four views of every part on one random body and of the body alone, deterministic in (body, seed)."""
-    number = list(BODIES).index(body)
+    number, parts = list(catalogue.body_weights).index(body), list(catalogue.part_weights)
     rng = np.random.default_rng([seed, number])
-    made = BODIES[body](rng)
+    made = catalogue.make_body(body, rng)
     warp = _Warp(made.solid, rng)
     base = warp(made.solid)
     base_caster, camera = RayCaster(base), _overview(rng)
@@ -67,15 +66,17 @@ def make_views(body: str, seed: int) -> Views:
             if changed_pixels(one / 127.0, two / 127.0) >= LEAST_PIXELS:
                 rows.append((one, two, label, number, closeup, blob))
 
-    for label, part in enumerate(PARTS):
-        original = PARTS[part](made, rng)
+    for label, part in enumerate(parts):
+        if not catalogue.suits(body, part):
+            continue
+        original = catalogue.grow(made, part, rng).solid
         solid = warp(_distorted(original, rng))
         closeup = bool(rng.random() < CLOSEUP_SHARE)
         see(solid, label, closeup, False)
         if rng.random() < BLOB_SHARE:
-            see(warp(blobs_of(original, rng)), len(PARTS), closeup, True)
+            see(warp(blobs_of(original, rng)), len(parts), closeup, True)
     alone = _views(shade(*hits, rays[2]))
-    rows += [(view, view, len(PARTS), number, False, False) for view in alone]
+    rows += [(view, view, len(parts), number, False, False) for view in alone]
     return Views(*(np.array(column) for column in zip(*rows, strict=True)))
 
 

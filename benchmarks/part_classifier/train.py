@@ -2,6 +2,7 @@
 
 python benchmarks/part_classifier/train.py                      # about 15 minutes of one core; goes on after a kill
 python benchmarks/part_classifier/train.py --measure            # accuracy per part of the packed weights
+python benchmarks/part_classifier/train.py --words fine         # bodies and parts of the finer prior, in `fine`
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from torch.nn.functional import avg_pool2d, cross_entropy, pad
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from model import CLASSES, PartNetwork, load_classifier, save_classifier  # noqa: E402
+from model import NOTHING, PartNetwork, load_classifier, save_classifier  # noqa: E402
 from pictures import SEEN_SEED, UNSEEN_SEED, Views, make_views  # noqa: E402
 
-from fd_mitsuba.prior.data.bodies import BODIES  # noqa: E402
+from fd_mitsuba.prior.data.catalogue import COARSE, FINE, Catalogue  # noqa: E402
 
 FOLDER = Path(__file__).parent
 _BATCH = 96
 _FIRST_BODIES = 27
-_NAMES = list(BODIES)
+CATALOGUES = {"coarse": COARSE, "fine": FINE}
 
 
 def joined(many: list[Views]) -> Views:
@@ -37,13 +38,14 @@ def joined(many: list[Views]) -> Views:
     return Views(*(np.concatenate([getattr(views, name) for views in many]) for name in columns))
 
 
-def kept_views(folder: Path, number: int) -> Views:
+def kept_views(folder: Path, number: int, catalogue: Catalogue) -> Views:
     """The views of training body `number`, made once and then read from `folder/views`."""
     path = folder / "views" / f"{number:05d}.npz"
     if path.is_file():
         with np.load(path) as data:
             return Views(**data)
-    views = make_views(_NAMES[number % len(_NAMES)], SEEN_SEED + number)
+    names = list(catalogue.body_weights)
+    views = make_views(names[number % len(names)], SEEN_SEED + number, catalogue)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".tmp.npz")
     np.savez(unfinished, **vars(views))
@@ -67,16 +69,18 @@ def batch(
     return before, after, torch.from_numpy(views.label[chosen])
 
 
-def train(folder: Path, bodies: int, steps: int, seconds: float) -> None:
+def train(folder: Path, bodies: int, steps: int, seconds: float, catalogue: Catalogue = COARSE) -> None:
     """Train while `bodies` random bodies come in; writes weights now and then, goes on from a checkpoint.
 
     Args:
         folder: for the weights; `checkpoint.pt` and `views` lie in it while the training is not finished.
+        catalogue: whose bodies and parts.
         steps, seconds: what comes first ends it; the learning rate falls with the larger of both shares.
     """
     torch.manual_seed(0)
-    network = PartNetwork().to(memory_format=torch.channels_last)
-    average = PartNetwork()
+    classes = (*catalogue.part_weights, NOTHING)
+    network = PartNetwork(classes).to(memory_format=torch.channels_last)
+    average = PartNetwork(classes)
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=0.02, fused=True)
     step, spent, checkpoint = 0, 0.0, folder / "checkpoint.pt"
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +97,7 @@ def train(folder: Path, bodies: int, steps: int, seconds: float) -> None:
     while (progress := max(progress, step / steps, (spent + time.monotonic() - started) / seconds)) < 1:
         wanted = min(bodies, _FIRST_BODIES + int(1.2 * step / steps * bodies))
         if len(made) < wanted:
-            made += [kept_views(folder, number) for number in range(len(made), wanted)]
+            made += [kept_views(folder, number, catalogue) for number in range(len(made), wanted)]
             pool = joined(made)
         before, after, label = batch(pool, rng, generator)
         rate = 2e-3 * min(1.0, (step + 1) / 60) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * progress)))
@@ -125,14 +129,15 @@ def train(folder: Path, bodies: int, steps: int, seconds: float) -> None:
     shutil.rmtree(folder / "views", ignore_errors=True)
 
 
-def measure(folder: Path, rounds: int) -> dict:
+def measure(folder: Path, rounds: int, catalogue: Catalogue = COARSE) -> dict:
     """Accuracy on `rounds` unseen random bodies of each kind, per class, a view alone and the four views' mean."""
     classifier = load_classifier(folder)
-    views = joined([make_views(body, UNSEEN_SEED + turn) for turn in range(rounds) for body in BODIES])
+    names = list(catalogue.body_weights)
+    views = joined([make_views(body, UNSEEN_SEED + turn, catalogue) for turn in range(rounds) for body in names])
     pair = (views.before / np.float32(127), views.after / np.float32(127))
     right = classifier(*pair).argmax(1) == views.label
     per_part = {}
-    for label, name in enumerate(CLASSES):
+    for label, name in enumerate(classifier.classes):
         of_part = (views.label == label) & ~views.blob
         groups = {"overview": of_part & ~views.closeup, "closeup": of_part & views.closeup}
         per_part[name] = {key: round(float(right[where].mean()), 3) for key, where in groups.items() if where.any()}
@@ -142,13 +147,14 @@ def measure(folder: Path, rounds: int) -> dict:
         "accuracy": round(float(right.mean()), 4),
         "blobs_refused": round(float(right[views.blob].mean()), 4),
         "per_part": per_part,
-        "per_body": {name: round(float(right[views.body == i].mean()), 3) for i, name in enumerate(BODIES)},
+        "per_body": {name: round(float(right[views.body == i].mean()), 3) for i, name in enumerate(names)},
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=FOLDER, metavar="FOLDER")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: this folder, or `fine` in it")
+    parser.add_argument("--words", choices=CATALOGUES, default="coarse", help="which prior's; default: coarse")
     parser.add_argument("--bodies", type=int, default=500, help="random bodies, all parts each; default: 500")
     parser.add_argument("--steps", type=int, default=1600, help="of 96 views; default: 1600")
     parser.add_argument("--seconds", type=float, default=1e9, help="end, with a finished schedule, after this time")
@@ -156,10 +162,12 @@ def main() -> None:
     parser.add_argument("--measure", action="store_true", help="do not train")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    catalogue = CATALOGUES[options.words]
+    output = options.output or (FOLDER if catalogue is COARSE else FOLDER / options.words)
     if not options.measure:
-        train(options.output, options.bodies, options.steps, options.seconds)
-    figures = measure(options.output, options.rounds)
-    (options.output / "accuracy.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        train(output, options.bodies, options.steps, options.seconds, catalogue)
+    figures = measure(output, options.rounds, catalogue)
+    (output / "accuracy.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(figures, indent=2))
 
 

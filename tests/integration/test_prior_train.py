@@ -10,12 +10,17 @@ import pytest
 import torch
 
 import fd_mitsuba.prior.training.train as train_module
+from fd_mitsuba.cli.main import main
+from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import Interrupted, UserError
-from fd_mitsuba.guidance.builtin import builtin_folder
-from fd_mitsuba.prior.training.kinds import APPEARANCE, KINDS, kind_named
+from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER, builtin_folder
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.interface import GuidanceViews
+from fd_mitsuba.prior.training.kinds import APPEARANCE, GEOMETRY, GEOMETRY_FINE, KINDS, kind_named
 from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, tokenize
 from fd_mitsuba.prior.training.pack import pack
-from fd_mitsuba.prior.training.train import Pool, train
+from fd_mitsuba.prior.training.pool import Pool, WorkerPool
+from fd_mitsuba.prior.training.train import train
 from fd_mitsuba.prior.training.training_folder import TrainingFolder
 
 
@@ -49,6 +54,42 @@ def test_the_appearance_prior_trains_with_its_own_pictures(tmp_path: Path) -> No
         train(tmp_path / "run", seconds=600, batch_size=2, total_steps=2)
 
 
+def test_the_finer_prior_goes_on_where_it_was_and_answers_with_larger_views(tmp_path: Path) -> None:
+    run, packed = tmp_path / "run", tmp_path / "packed"
+    train(run, seconds=600, kind=GEOMETRY_FINE, batch_size=2, total_steps=1, init=BUILTIN_FOLDER)
+    train(run, seconds=600, kind=GEOMETRY_FINE, batch_size=2, total_steps=2, init=BUILTIN_FOLDER)
+    assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
+    pack(run / "checkpoint.pt", packed)
+    assert sum(path.stat().st_size for path in packed.rglob("*")) < 25e6
+    guidance = DiffusionGuidance.load(GuidanceConfig(model=str(packed), normalise_gradient=True))
+    assert guidance.picture_size("coarse") == 64 and builtin_folder(packed)
+    assert guidance.set_prompt("a dragon with bat wings") == []
+    pictures = torch.rand(4, 5, 64, 64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    views = GuidanceViews(pictures, torch.rand(4, 5, 64, 64), [0.0, 90.0, 180.0, 270.0], [10.0] * 4, closeup=True)
+    result = guidance.guide(views, 0, 10, "coarse", 0)
+    result.loss.backward()
+    assert pictures.grad is not None and pictures.grad.isfinite().all() and pictures.grad.abs().sum() > 0
+    assert result.preview.shape == (1, 4, 128, 128)
+
+
+def test_worker_processes_fill_the_pool() -> None:
+    pool = WorkerPool(GEOMETRY, seed=5, workers=1)
+    try:
+        pool.refresh(20)
+        base, edited, part, captions = pool.batch(4)
+    finally:
+        pool.close()
+    assert base.shape == edited.shape == (4, 4, 64, 64) and part.shape == (4, 1, 64, 64) and all(captions)
+    assert not any(process.is_alive() for process in pool._processes)
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("cuda:63", "gpu"):
+        assert main(["prior", "train", "--device", name, "-o", str(tmp_path / "run")]) != 0
+        assert f"--device = '{name}'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
     train(tmp_path, seconds=3600, kind=APPEARANCE, total_steps=600)
@@ -73,8 +114,8 @@ def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named() -> None:
-    assert {kind_named(name).name for name in KINDS} == {"geometry", "appearance"}
-    with pytest.raises(UserError, match="known: geometry, appearance"):
+    assert {kind_named(name).name for name in KINDS} == {"geometry", "geometry_fine", "appearance"}
+    with pytest.raises(UserError, match="known: geometry, geometry_fine, appearance"):
         kind_named("smell")
 
 

@@ -9,10 +9,11 @@ import torch
 
 from fd_mitsuba.evaluation.clip import ClipJudge
 from fd_mitsuba.prior.data.captions import BODY_WORDS, PART_WORDS, vocabulary
+from fd_mitsuba.prior.data.catalogue import FINE
 from fd_mitsuba.prior.data.clip_captions import ANY_STYLE, NO_PART, STYLES, Claim, true_of, write_caption
 from fd_mitsuba.prior.judging.clip_evaluate import retrieval
 from fd_mitsuba.prior.judging.evaluate import UNSEEN_SEED as PRIOR_UNSEEN_SEED
-from fd_mitsuba.prior.pictures.clip_corpus import TRAINING_SEED, UNSEEN_SEED, random_pictures
+from fd_mitsuba.prior.pictures.clip_corpus import TRAINING_SEED, UNSEEN_SEED, View, make_pictures, random_pictures
 from fd_mitsuba.prior.training.clip_model import build_clip_tokenizer
 from fd_mitsuba.prior.training.clip_train import SEEDS_A_SHARD, SHARDS, contrastive_loss, train_evaluator
 from fd_mitsuba.prior.training.pack import pack
@@ -67,6 +68,17 @@ def test_pictures_are_the_seeds_and_in_pairs() -> None:
         empty = normals.body_share == 0
         patches = normals.pixels.reshape(8, 8, 8, 8, 3).swapaxes(1, 2)
         assert empty.any() and not patches[empty].any()
+
+
+def test_the_finer_words_have_pictures_and_captions_too() -> None:
+    names, rng = list(FINE.part_weights), np.random.default_rng(0)
+    view = View.at(0.6, 0.3, 3.4, 1.4, np.zeros(3))
+    pictures = make_pictures("person", ["glasses", "backpack"], UNSEEN_SEED + 9, [view], catalogue=FINE)
+    shown = {names[p.shown.part] for p in pictures if p.shown.part != NO_PART}
+    assert "glasses" in shown and len(pictures) >= 4
+    for picture in pictures:
+        text, claim = write_caption(picture.shown, rng, FINE)
+        assert true_of(np.array([claim]), np.array([picture.shown])).all(), text
 
 
 def test_training_learns_resumes_and_packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

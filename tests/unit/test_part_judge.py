@@ -18,11 +18,19 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.builtin import builtin_folder
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.catalogue import FINE
 from fd_mitsuba.prior.data.parts import PARTS
 from fd_mitsuba.prior.data.primitives import join
 from fd_mitsuba.prior.judging.body_namer import BodyNamer
 from fd_mitsuba.prior.judging.evaluate_parts import evaluate_parts, judge_sample, summary
-from fd_mitsuba.prior.judging.part_judge import CHECKOUT_CLASSIFIER, LEAST_PIXELS, changed_pixels, load_judge, views_of
+from fd_mitsuba.prior.judging.part_judge import (
+    CHECKOUT_CLASSIFIER,
+    LEAST_PIXELS,
+    changed_pixels,
+    load_judge,
+    seen_by_judge,
+    views_of,
+)
 from fd_mitsuba.prior.pictures.corpus import Pair, RayCaster, make_pairs, shade
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.region_place import share_in_grid
@@ -213,3 +221,18 @@ def test_the_classifier_names_parts_of_unseen_bodies() -> None:
     assert (said.argmax(1) == label).mean() > 0.6
     assert (judge(before, before).argmax(1) == len(PARTS)).mean() > 0.97
     assert sum(path.stat().st_size for path in CHECKOUT_CLASSIFIER.glob("*.safetensors")) < 2e6
+
+
+def test_a_classifier_of_other_words_keeps_them(tmp_path: Path) -> None:
+    model, pictures = benchmark("part_classifier/model"), benchmark("part_classifier/pictures")
+    names = (*FINE.part_weights, "none")
+    model.save_classifier(model.PartNetwork(names), tmp_path / "fine")
+    (tmp_path / "model.py").write_bytes((CHECKOUT_CLASSIFIER / "model.py").read_bytes())
+    judge = load_judge(tmp_path / "fine")
+    assert judge.classes == names
+    views = pictures.make_views("elephant", pictures.UNSEEN_SEED, FINE)
+    shown = {names[label] for label in views.label}
+    assert len(shown) > 25 and "tusks" in shown and views.before.shape[1:] == (4, 32, 32)
+    said = judge(views.before[:3] / np.float32(127), views.after[:3] / np.float32(127))
+    assert said.shape == (3, len(names))
+    assert seen_by_judge(np.ones((2, 4, 64, 64), np.float32)).shape == (2, 4, 32, 32)

@@ -15,7 +15,8 @@ from fd_mitsuba.prior.data.captions import HELD_OUT
 from fd_mitsuba.prior.training import dataset
 from fd_mitsuba.prior.training.dataset import StoredPairs, build_data
 from fd_mitsuba.prior.training.kinds import APPEARANCE, GEOMETRY
-from fd_mitsuba.prior.training.train import draw_pairs, train
+from fd_mitsuba.prior.training.pool import draw_pairs
+from fd_mitsuba.prior.training.train import train
 
 
 @pytest.fixture

@@ -18,7 +18,10 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     actions = prior.add_subparsers(dest="action", metavar="ACTION")
     train = actions.add_parser("train", help="train on fresh pictures; goes on where the folder's checkpoint ends")
     train.add_argument(
-        "--kind", default="geometry", help="geometry (normals), appearance (colours) or evaluator (the metrics' CLIP)"
+        "--kind",
+        default="geometry",
+        help="geometry (normals), geometry_fine (at 64 pixels a view), appearance (colours) or evaluator (the "
+        "metrics' CLIP)",
     )
     train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, help="length of the schedule; default: what the kind takes to be good")
@@ -26,6 +29,11 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     train.add_argument("--init", metavar="FOLDER", help="start from a packed prior instead of random weights")
     train.add_argument("--data", metavar="FOLDER", help="train on stored pairs of build-data instead of fresh ones")
     train.add_argument("--bf16", action="store_true", help="bfloat16: faster on a processor that has it (AVX512-BF16)")
+    train.add_argument("--batch", type=int, default=8, metavar="N", help="pictures a step; default: 8")
+    train.add_argument("--device", default="cpu", help="cpu or cuda; with cuda, render by --workers or from --data")
+    train.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="processes that render; default: the training itself"
+    )
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("-t", "--threads", type=int, default=0, metavar="N")
     train.set_defaults(call=_prior_train)
@@ -35,7 +43,7 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     pack.set_defaults(call=_prior_pack)
     build = actions.add_parser("build-data", help="write training pairs as files; goes on where a killed call ended")
     build.add_argument("-o", "--output", default="runs/prior_data", metavar="FOLDER")
-    build.add_argument("--kind", default="geometry", help="geometry (normals) or appearance (colours)")
+    build.add_argument("--kind", default="geometry", help="geometry, geometry_fine or appearance (colours)")
     build.add_argument("--count", type=int, default=2048, help="pairs of four views each; default: 2048")
     build.add_argument("--seed", type=int, default=0)
     build.add_argument("-t", "--threads", type=int, default=0, metavar="N")
@@ -52,7 +60,9 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
         "A colour sample takes 1 s, a painted prompt (--paint) about 5 s.",
     )
     evaluate.add_argument("folder", nargs="?", help="packed prior; default: the built-in one")
-    evaluate.add_argument("--kind", default="geometry", help="geometry (default), appearance or evaluator")
+    evaluate.add_argument(
+        "--kind", default="geometry", help="geometry (default), geometry_fine, appearance or evaluator"
+    )
     evaluate.add_argument("-o", "--output", metavar="FILE", help="PNG; the figures go into a .json beside it")
     evaluate.add_argument(
         "--bodies", default="horse,cat,snowman,mug", metavar="A,B", help="or all; default: %(default)s"
@@ -98,11 +108,14 @@ def _prior_train(options: argparse.Namespace) -> int:
     share_cores(options.threads)
     if options.kind == "evaluator":
         return _evaluator_train(options)
+    from fd_mitsuba.guidance.device import require_device
     from fd_mitsuba.prior.training.dataset import StoredPairs
     from fd_mitsuba.prior.training.kinds import kind_named
     from fd_mitsuba.prior.training.train import train
 
-    kind = kind_named(options.kind)
+    if options.batch < 1 or options.workers < 0:
+        raise UserError(f"--batch {options.batch}, --workers {options.workers}: at least 1 and at least 0")
+    kind, device = kind_named(options.kind), require_device(options.device, "--device")
     init = Path(options.init) if options.init else None
     if init is not None and not (init / "model_index.json").is_file():
         raise UserError(f"{init}: not a packed prior; make one with fd_mitsuba prior pack")
@@ -116,6 +129,9 @@ def _prior_train(options: argparse.Namespace) -> int:
             init=init,
             pairs=StoredPairs(Path(options.data), kind, options.seed) if options.data else None,
             half=options.bf16,
+            batch_size=options.batch,
+            device=str(device),
+            workers=options.workers,
         )
     print(f"{options.output}: checkpoint.pt and log.jsonl")
     return 0
@@ -170,10 +186,12 @@ def _prior_evaluate(options: argparse.Namespace) -> int:
     share_cores(options.threads)
     from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 
-    shipped = BUILTIN_FOLDER if kind == "geometry" else APPEARANCE_FOLDER
-    folder = Path(options.folder) if options.folder else builtin_folder(shipped)
+    shipped = {"geometry": BUILTIN_FOLDER, "appearance": APPEARANCE_FOLDER}
+    if not options.folder and kind not in shipped:
+        raise UserError(f"--kind {kind}: no such prior is shipped; name its packed folder")
+    folder = Path(options.folder) if options.folder else builtin_folder(shipped[kind])
     output = Path(options.output or f"runs/prior_{kind}.png").with_suffix(".png")
-    (_evaluate_shapes if kind == "geometry" else _evaluate_colours)(options, folder, output)
+    (_evaluate_colours if kind == "appearance" else _evaluate_shapes)(options, folder, output)
     print(f"{output}, {output.with_suffix('.json')}")
     return 0
 
@@ -192,12 +210,12 @@ def _evaluator_evaluate(options: argparse.Namespace) -> int:
 
 def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) -> None:
     from fd_mitsuba.evaluation.clip import ClipJudge
-    from fd_mitsuba.prior.data.bodies import BODIES
-    from fd_mitsuba.prior.data.parts import PARTS
     from fd_mitsuba.prior.judging.body_namer import BodyNamer
     from fd_mitsuba.prior.judging.evaluate_parts import evaluate_parts
     from fd_mitsuba.prior.judging.part_judge import CHECKOUT_CLASSIFIER, load_judge
+    from fd_mitsuba.prior.training.kinds import kind_named
 
+    kind = kind_named(options.kind)
     if options.classifier or (CHECKOUT_CLASSIFIER / "weights.safetensors").is_file():
         judge = load_judge(Path(options.classifier) if options.classifier else CHECKOUT_CLASSIFIER)
     else:
@@ -205,7 +223,10 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
         remark("no classifier of parts here, so recall is left out; give one by --classifier")
     bodies, parts = (
         list(known) if text == "all" else [name.strip() for name in text.split(",") if name.strip()]
-        for text, known in ((options.bodies, BODIES), (options.parts, PARTS))
+        for text, known in (
+            (options.bodies, kind.catalogue.body_weights),
+            (options.parts, kind.catalogue.part_weights),
+        )
     )
     report = evaluate_parts(
         folder,
@@ -219,6 +240,7 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
         not options.overviews,
         BodyNamer(ClipJudge.load()),
         remark,
+        kind,
     )
     for part, row in {**report["per_part"], "kept out of training": report["held_out"]}.items():
         print(
@@ -226,6 +248,8 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
             f"{_share(row['recall_in_truth'])}), body named in {_share(row['body_named'])}, kept pixel by pixel in "
             f"{_share(row['body_kept'])}, its shape in {_share(row['shape_kept'])}"
         )
+    if report["removal"]["samples"]:
+        print(f"taken off as prompted: {_share(report['removal']['taken_off'])} of {report['removal']['samples']}")
     for name, bar in report["bars"].items():
         print(f"{name}: {_share(bar['measured'])}, wanted {bar['least']:.0%}")
 

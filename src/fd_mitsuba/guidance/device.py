@@ -7,23 +7,29 @@ import torch
 from fd_mitsuba.errors import UserError
 
 
-def require_device(name: str) -> torch.device:
+def require_device(name: str, setting: str = "guidance.device") -> torch.device:
     """The torch device of a name: `cpu`, `cuda`, `cuda:1`, `mps`.
 
+    Args:
+        setting: what the user wrote the name in, for the message.
+
     Raises:
-        UserError: torch was built without it, or this machine has no such device.
+        UserError: no such kind of device, torch was built without it, or this machine has no such device.
     """
-    device = torch.device(name)
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UserError(f"{setting} = {name!r}: torch knows no such device; take cpu or cuda") from None
     if device.type == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if count <= (device.index or 0):
             found = f"{count} CUDA device{'' if count == 1 else 's'}"
             raise UserError(
-                f"guidance.device = {name!r}: torch {torch.__version__} finds {found}; set guidance.device to cpu, or "
+                f"{setting} = {name!r}: torch {torch.__version__} finds {found}; set {setting} to cpu, or "
                 "install a driver and a CUDA build of torch"
             )
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise UserError(
-            f"guidance.device = {name!r}: torch {torch.__version__} finds no Apple GPU; set guidance.device to cpu"
+            f"{setting} = {name!r}: torch {torch.__version__} finds no Apple GPU; set {setting} to cpu"
         )
     return device

@@ -106,6 +106,19 @@ NATURAL: dict[str, tuple[tuple[Material, ...], ...]] = {
 """Looks a part may have by nature; a look has one material for each of the part's zones, see `zones`."""
 
 
+NATURAL_STYLE = {
+    "crown": "gold",
+    "top hat": "black",
+    "cape": "red",
+    "skateboard": "wood",
+    "wings": "white",
+    "antlers": "brown",
+    "tail": "brown",
+    "glasses": "black",
+}
+"""The word that says most of a natural look; other looks have none."""
+
+
 def zones(part: str, piece: np.ndarray, pieces: int) -> np.ndarray:
     """Which of the natural look's materials a point has; `piece` (N,) numbers the closed pieces as they were made.
 

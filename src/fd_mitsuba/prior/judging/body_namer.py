@@ -24,6 +24,10 @@ class BodyNamer:
         self._judge = judge
         self._texts: dict[str | None, Tensor] = {}
 
+    def knows(self, body: str) -> bool:
+        """Whether it can name that body at all."""
+        return body in BODIES
+
     def __call__(self, views: np.ndarray, part: str | None) -> str:
         """The body whose sentence with `part` fits best.
 

@@ -15,10 +15,8 @@ from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.prior.data.bodies import BODIES
-from fd_mitsuba.prior.data.captions import HELD_OUT
-from fd_mitsuba.prior.data.parts import PARTS
-from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
+from fd_mitsuba.prior.pictures.corpus import Pair
+from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
 
 UNSEEN_SEED = 2**31
 """Bodies and parts of the evaluation come from seeds from here on; training draws its own below."""
@@ -75,7 +73,13 @@ def draw_samples(
 
 
 def evaluate(
-    folder: Path, output: Path, bodies: list[str], parts: list[str], seed: int = 0, steps: int = 16
+    folder: Path,
+    output: Path,
+    bodies: list[str],
+    parts: list[str],
+    seed: int = 0,
+    steps: int = 16,
+    kind: Kind = GEOMETRY,
 ) -> list[SampleFigures]:
     """Write `output` (one row of truth and one of samples a body; overviews left, close-ups right) and measure.
 
@@ -83,15 +87,17 @@ def evaluate(
         folder: a packed pipeline folder.
         bodies, parts: names of the vocabulary.
         steps: of DDIM.
+        kind: what the folder was trained as.
 
     Raises:
         UserError: a name outside the vocabulary.
     """
-    check_names(bodies, parts)
+    check_names(bodies, parts, kind)
+    known = list(kind.catalogue.body_weights)
     guidance = DiffusionGuidance.load(GuidanceConfig(model=str(folder), views_per_call=16))
     rows, judged = [], []
     for number, body in enumerate(bodies):
-        pairs = make_pairs(body, [*parts, None], UNSEEN_SEED + 1000 * seed + list(BODIES).index(body))
+        pairs = kind.make_pairs(body, [*parts, None], UNSEEN_SEED + 1000 * seed + known.index(body))
         base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
         sampled = draw_samples(guidance, base, [pair.caption for pair in pairs], seed * 100 + number, steps)
         judged += [_judge(pair, latent.numpy()) for pair, latent in zip(pairs, sampled, strict=True)]
@@ -104,7 +110,7 @@ def evaluate(
     figures = []
     for part in (None, *parts):
         for held_out in (False, True):
-            of_part = [j for p, b, j in judged if p == part and ((b, p) in HELD_OUT) == held_out]
+            of_part = [j for p, b, j in judged if p == part and ((b, p) in kind.catalogue.held_out) == held_out]
             if of_part:
                 kept, overlap = np.mean(of_part, axis=0)
                 figures.append(SampleFigures(part, held_out, len(of_part), float(kept), float(overlap)))
@@ -118,9 +124,10 @@ def _judge(pair: Pair, sample: np.ndarray) -> tuple[str | None, str, tuple[float
     return pair.part, pair.body, (float(kept), float((changed & wanted).sum() / union) if union else 1.0)
 
 
-def check_names(bodies: Sequence[str], parts: Sequence[str]) -> None:
+def check_names(bodies: Sequence[str], parts: Sequence[str], kind: Kind = GEOMETRY) -> None:
     """UserError for a name outside the vocabulary."""
-    for name, known in [*((body, BODIES) for body in bodies), *((part, PARTS) for part in parts)]:
+    there = kind.catalogue.body_weights, kind.catalogue.part_weights
+    for name, known in [*((body, there[0]) for body in bodies), *((part, there[1]) for part in parts)]:
         if name not in known:
             raise UserError(f"{name!r}: no such name; known: {', '.join(known)}")
 

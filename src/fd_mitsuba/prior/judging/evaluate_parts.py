@@ -14,8 +14,7 @@ from PIL import Image
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.prior.data.bodies import BODIES
-from fd_mitsuba.prior.data.captions import HELD_OUT
+from fd_mitsuba.prior.data.captions import PART_WORDS
 from fd_mitsuba.prior.judging.body_namer import BodyNamer
 from fd_mitsuba.prior.judging.evaluate import (
     KEPT_WITHIN,
@@ -27,14 +26,22 @@ from fd_mitsuba.prior.judging.evaluate import (
     keeps_body,
     picture,
 )
-from fd_mitsuba.prior.judging.part_judge import LEAST_PIXELS, NOTHING, PartJudge, changed_pixels, views_of
-from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
+from fd_mitsuba.prior.judging.part_judge import (
+    LEAST_PIXELS,
+    NOTHING,
+    PartJudge,
+    changed_pixels,
+    seen_by_judge,
+    views_of,
+)
+from fd_mitsuba.prior.pictures.corpus import Pair
+from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
 
 PLAIN_PROMPTS = 3
 """Prompts without a part for each body."""
 LEAST_RECALL, LEAST_RECALL_OF_A_PART, LEAST_KEPT, LEAST_UNCHANGED = 0.85, 0.60, 0.95, 0.97
 _UNCHANGED_SHARE = 0.01
-_SHAPE_WITHIN = 0.5
+_SHAPE_WITHIN, _TAKEN_SHARE = 0.5, 0.9
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ class JudgedSample:
         shape_kept: as `body_kept` with 0.5, half the length of a normal: nothing of the body is gone or replaced.
         body_error: mean of the largest channel's difference over those pixels.
         unchanged: at most 1 % of the pixels differ from the base.
+        taken_off: for a prompt that takes the part away, whether 90 % of its pixels are as they are without it.
     """
 
     body: str
@@ -72,6 +80,7 @@ class JudgedSample:
     shape_kept: bool
     body_error: float
     unchanged: bool
+    taken_off: bool | None = None
 
 
 def evaluate_parts(
@@ -86,17 +95,19 @@ def evaluate_parts(
     closeups: bool = True,
     namer: BodyNamer | None = None,
     say: Callable[[str], None] = lambda line: None,
+    kind: Kind = GEOMETRY,
 ) -> dict:
     """Sample, judge, and write the sheet `output` (a row of truth and one of samples a body) and `output`.json.
 
     Args:
         folder: a packed pipeline folder of the shape prior.
         judge: None leaves recall out.
-        bodies, parts: names of the vocabulary; every pair is sampled.
+        bodies, parts: names of the vocabulary; every pair that makes sense is sampled.
         steps, scale: of DDIM, and of the text guidance.
         closeups: also the views that are centred on the part.
         namer: None leaves out whether the body is still named right.
         say: takes a line a body.
+        kind: what the folder was trained as. Parts and bodies that judge or namer do not know are not judged by them.
 
     Returns:
         What the JSON file holds; see `summary`.
@@ -104,23 +115,31 @@ def evaluate_parts(
     Raises:
         UserError: a name outside the vocabulary.
     """
-    check_names(bodies, parts)
+    check_names(bodies, parts, kind)
     guidance = DiffusionGuidance.load(GuidanceConfig(model=str(folder), views_per_call=16))
     rows: list[list[np.ndarray]] = []
     judged: list[JudgedSample] = []
     for body in bodies:
-        number = list(BODIES).index(body)
+        number = list(kind.catalogue.body_weights).index(body)
         body_seed = UNSEEN_SEED + 1000 * seed + number
-        pairs = make_pairs(body, [*parts, *[None] * PLAIN_PROMPTS], body_seed)
+        own_parts = [part for part in parts if kind.catalogue.suits(body, part)]
+        pairs = list(kind.make_pairs(body, [*own_parts, *[None] * PLAIN_PROMPTS], body_seed))
         pairs = sorted((p for p in pairs if closeups or not p.closeup), key=lambda p: p.closeup)
         # The same body and overview again, whose second parts of each name are others.
-        again = [p for p in make_pairs(body, [*parts, *parts], body_seed) if not p.closeup]
-        others: dict[str | None, Pair] = {p.part: p for p in again[len(parts) :]}
+        again = [p for p in kind.make_pairs(body, [*own_parts, *own_parts], body_seed) if not p.closeup]
+        others: dict[str | None, Pair] = {p.part: p for p in again[len(own_parts) :] if not p.removed}
         base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
         captions = [pair.caption for pair in pairs]
         samples = draw_samples(guidance, base, captions, seed * 100 + number, steps, scale).numpy()
         of_body = [
-            judge_sample(pair, sample, judge, None if pair.closeup else others.get(pair.part), namer)
+            judge_sample(
+                pair,
+                sample,
+                judge,
+                None if pair.closeup else others.get(pair.part),
+                namer,
+                kind,
+            )
             for pair, sample in zip(pairs, samples, strict=True)
         ]
         judged += of_body
@@ -144,30 +163,39 @@ def judge_sample(
     judge: PartJudge | None,
     other: Pair | None = None,
     namer: BodyNamer | None = None,
+    kind: Kind = GEOMETRY,
 ) -> JudgedSample:
-    """What is said of one sampled mosaic (4, 64, 64); `other` is the same view with another such part."""
+    """What is said of one sampled mosaic (4, L, L); `other` is the same view with another such part."""
     base, truth = (latent.astype(np.float32) / 127 for latent in (pair.base, pair.edited))
-    before, after, wanted = (views_of(mosaic[None]) for mosaic in (base, sample, truth))
+    before, after, wanted = (seen_by_judge(views_of(mosaic[None])) for mosaic in (base, sample, truth))
     found = in_truth = share = None
     shown = changed_pixels(before, wanted) >= LEAST_PIXELS if pair.part else np.ones(len(before), bool)
-    if judge is not None and shown.any():
+    if judge is not None and shown.any() and not pair.removed and (pair.part or NOTHING) in judge.classes:
         label = judge.classes.index(pair.part or NOTHING)
         drawn, ideal = (judge(before[shown], views[shown]) for views in (after, wanted))
         found, in_truth = (bool(said.mean(0).argmax() == label) for said in (drawn, ideal))
         share = float((drawn.argmax(1) == label).mean())
     unchanged = float((np.abs(sample - base).max(0) > 0.3).mean()) <= _UNCHANGED_SHARE
-    held_out = (pair.body, pair.part) in HELD_OUT
+    held_out = (pair.body, pair.part) in kind.catalogue.held_out
     kept, shape = (keeps_body(base, truth, sample, within) for within in (KEPT_WITHIN, _SHAPE_WITHIN))
     in_truth_kept = None if other is None else keeps_body(base, truth, other.edited.astype(np.float32) / 127)
     named = named_in_truth = None
-    if namer is not None and not pair.closeup:
+    if (
+        namer is not None
+        and not pair.closeup
+        and namer.knows(pair.body)
+        and (pair.part is None or pair.part in PART_WORDS)
+    ):
         named, named_in_truth = (namer(colours(views), pair.part) == pair.body for views in (after, wanted))
     body = body_pixels(base, truth)
     error = round(float(np.abs(sample - base).max(0)[body].mean()), 4) if body.any() else 0.0
+    gone = None
+    if pair.removed:
+        gone = bool((np.abs(sample - truth).max(0) < _SHAPE_WITHIN)[pair.changed()].mean() > _TAKEN_SHARE)
     return JudgedSample(
-        pair.body, pair.part, pair.closeup, held_out,
+        pair.body, None if pair.removed else pair.part, pair.closeup, held_out,
         found, in_truth, share, named, named_in_truth,
-        kept, in_truth_kept, shape, error, unchanged,
+        kept, in_truth_kept, shape, error, unchanged, gone,
     )  # fmt: skip
 
 
@@ -192,7 +220,8 @@ def summary(samples: Sequence[JudgedSample]) -> dict:
         }
 
     with_part = [s for s in samples if s.part]
-    plain = [s for s in samples if s.part is None]
+    plain = [s for s in samples if s.part is None and s.taken_off is None]
+    removals = [s for s in samples if s.taken_off is not None]
     per_part = {
         part: shares([s for s in with_part if s.part == part]) for part in dict.fromkeys(s.part for s in with_part)
     }
@@ -218,6 +247,7 @@ def summary(samples: Sequence[JudgedSample]) -> dict:
             "shape_kept": _mean([s.shape_kept for s in plain]),
             "body_error": _mean([s.body_error for s in plain]),
         },
+        "removal": {"samples": len(removals), "taken_off": _mean([s.taken_off for s in removals])},
         "per_part": per_part,
         "bars": {
             name: {"measured": value, "least": least, "met": None if value is None else value >= least}

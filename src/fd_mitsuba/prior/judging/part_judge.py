@@ -16,6 +16,8 @@ import numpy as np
 from fd_mitsuba.errors import UserError
 
 NOTHING = "none"
+VIEW_SIZE = 32
+"""Side in pixels of the views that it judges."""
 LEAST_PIXELS = 5.0
 """A view shows a part if at least so many of its pixels change."""
 CHECKOUT_CLASSIFIER = Path(__file__).resolve().parents[4] / "benchmarks" / "part_classifier"
@@ -33,12 +35,14 @@ class PartJudge(Protocol):
 
 
 def load_judge(folder: Path = CHECKOUT_CLASSIFIER) -> PartJudge:
-    """The classifier of a folder: `load_classifier(folder)` of its `model.py`, which is run.
+    """The classifier of a folder: `load_classifier(folder)` of its `model.py` or the one above it, which is run.
 
     Raises:
         UserError: no such folder, or no weights in it.
     """
     model = folder / "model.py"
+    if not model.is_file():
+        model = folder.parent / "model.py"
     if not model.is_file() or not (folder / "weights.safetensors").is_file():
         raise UserError(
             f"{folder}: no classifier there (model.py, weights.safetensors); give benchmarks/part_classifier of a "
@@ -59,6 +63,13 @@ def views_of(mosaics: np.ndarray) -> np.ndarray:
     count, channels, side = *mosaics.shape[:2], mosaics.shape[2] // 2
     split = mosaics.reshape(count, channels, 2, side, 2, side)
     return split.transpose(0, 2, 4, 1, 3, 5).reshape(4 * count, channels, side, side)
+
+
+def seen_by_judge(views: np.ndarray) -> np.ndarray:
+    """Views (N, C, S, S) at the judge's size: means of squares of pixels where they are larger."""
+    count, channels, side = views.shape[:3]
+    step = side // VIEW_SIZE
+    return views.reshape(count, channels, VIEW_SIZE, step, VIEW_SIZE, step).mean((3, 5))
 
 
 def changed_pixels(before: np.ndarray, after: np.ndarray) -> np.ndarray:

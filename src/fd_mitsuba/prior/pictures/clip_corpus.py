@@ -9,17 +9,16 @@ a run could start from stand where a part would, and are captioned as if they we
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.catalogue import COARSE, Catalogue
 from fd_mitsuba.prior.data.clip_captions import ANY_STYLE, NO_PART, NO_STYLE, STYLES, Claim
-from fd_mitsuba.prior.data.looks import NAMED, NATURAL, Material, random_body_look, zones
-from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.prior.data.looks import NAMED, Material, random_body_look
 from fd_mitsuba.prior.data.primitives import Solid, rotation, transform
 from fd_mitsuba.prior.data.starts import starts_like
 from fd_mitsuba.prior.pictures.colour_corpus import pieces_of
@@ -34,16 +33,6 @@ SIZE, SUPERSAMPLING, PATCH = 64, 2, 8
 STRETCH = 0.15
 LEAST_PIXELS = 14
 """A part that shows less is not visible: the picture is left out."""
-_NATURAL_STYLE = {
-    "crown": "gold",
-    "top hat": "black",
-    "cape": "red",
-    "skateboard": "wood",
-    "wings": "white",
-    "antlers": "brown",
-    "tail": "brown",
-    "glasses": "black",
-}
 
 
 @dataclass(frozen=True)
@@ -84,7 +73,13 @@ class View:
 
 
 def make_pictures(
-    body: str, parts: list[str], seed: int, cameras: list[View] | int = 5, parts_a_camera: int = 3, even: bool = False
+    body: str,
+    parts: list[str],
+    seed: int,
+    cameras: list[View] | int = 5,
+    parts_a_camera: int = 3,
+    even: bool = False,
+    catalogue: Catalogue = COARSE,
 ) -> list[JudgePicture]:
     """Normal and lit pictures of one random body: plain, with each of some parts, with a start.
 
@@ -93,36 +88,43 @@ def make_pictures(
         even: whether every camera sees the body plain and a start for each part that it sees, so that starts and parts
             are equally many; otherwise a start in the first, third, … view and the plain body in the others.
         seed: with `body` and `parts` decides everything.
+        catalogue: whose bodies and parts; parts must suit the body.
     """
-    rng = np.random.default_rng([seed, list(BODIES).index(body)])
-    made, stretch = BODIES[body](rng), np.diag(1 + STRETCH * rng.uniform(-1, 1, 3))
+    rng = np.random.default_rng([seed, list(catalogue.body_weights).index(body)])
+    made, stretch = catalogue.make_body(body, rng), np.diag(1 + STRETCH * rng.uniform(-1, 1, 3))
     solid = transform(made.solid, stretch)
     caster, light = RayCaster(solid), lit_by(random_environment(rng))
-    grown = {name: transform(varied(PARTS[name](made, rng), rng), stretch) for name in parts}
+    grown, zone_of = {}, {}
+    for name in parts:
+        part = catalogue.grow(made, name, rng)
+        grown[name], zone_of[name] = transform(varied(part.solid, rng), stretch), part.zone_of
     casters = {name: (RayCaster(part), pieces_of(part)) for name, part in grown.items()}
+    scene = _Scene(catalogue, body, solid, light)
     pictures = []
     for number, view in enumerate(cameras if isinstance(cameras, list) else [View.random(rng) for _ in range(cameras)]):
         base_hits = caster.cast(*view.rays)
         chosen = parts if isinstance(cameras, list) else list(rng.permutation(parts)[:parts_a_camera])
         for name in chosen:
             hits = visible(view.rays, base_hits, *casters[name])
-            pictures += _draw(hits, view, body, str(name), solid, grown[name], light, rng)
+            pictures += _draw(scene, hits, view, rng, str(name), grown[name], zone_of[name])
             if even:
-                pictures += _draw_start(grown[name], base_hits, view, body, solid, stretch, light, rng)
+                pictures += _draw_start(scene, grown[name], base_hits, view, stretch, rng)
         if even or number % 2 or not grown:
             hits = visible(view.rays, base_hits, _Nothing(), np.zeros(len(base_hits[0]), np.int64))
-            pictures += _draw(hits, view, body, None, solid, None, light, rng)
+            pictures += _draw(scene, hits, view, rng)
         else:
-            part = list(grown.values())[rng.integers(len(grown))]
-            pictures += _draw_start(part, base_hits, view, body, solid, stretch, light, rng)
+            chosen_part = list(grown.values())[rng.integers(len(grown))]
+            pictures += _draw_start(scene, chosen_part, base_hits, view, stretch, rng)
     return pictures
 
 
-def random_pictures(seed: int, even: bool = False) -> list[JudgePicture]:
+def random_pictures(seed: int, even: bool = False, catalogue: Catalogue = COARSE) -> list[JudgePicture]:
     """Pictures of the body and the parts that the seed draws; `even` as in `make_pictures`."""
     rng = np.random.default_rng([seed, 1000])
-    parts = [str(name) for name in rng.permutation(list(PARTS))[:5]]
-    return make_pictures(str(rng.choice(list(BODIES))), parts, seed, even=even)
+    parts = [str(name) for name in rng.permutation(list(catalogue.part_weights))]
+    body = str(rng.choice(list(catalogue.body_weights)))
+    parts = [part for part in parts if catalogue.suits(body, part)][:5]
+    return make_pictures(body, parts, seed, even=even, catalogue=catalogue)
 
 
 def varied(part: Solid, rng: np.random.Generator) -> Solid:
@@ -134,6 +136,16 @@ def varied(part: Solid, rng: np.random.Generator) -> Solid:
     waves = rng.normal(size=(3, 3)) * (3.0 / size)
     bend = 0.04 * size * rng.random() * np.sin(points @ waves + rng.uniform(0, 2 * np.pi, 3))
     return Solid(points + bend, part.faces)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What all pictures of one body share."""
+
+    catalogue: Catalogue
+    body: str
+    solid: Solid
+    light: Light
 
 
 class _Nothing:
@@ -149,30 +161,29 @@ def _aim(rng: np.random.Generator) -> np.ndarray:
 
 
 def _draw_start(
+    scene: _Scene,
     part: Solid,
     base_hits: tuple[np.ndarray, np.ndarray, np.ndarray],
     view: View,
-    body: str,
-    solid: Solid,
     stretch: np.ndarray,
-    light: Light,
     rng: np.random.Generator,
 ) -> list[JudgePicture]:
     start = transform(starts_like(part, rng), stretch)
     hits = visible(view.rays, base_hits, RayCaster(start), np.zeros(len(start.faces), np.int64))
-    return _draw(hits, view, body, None, solid, start, light, rng)
+    return _draw(scene, hits, view, rng, None, start)
 
 
 def _draw(
+    scene: _Scene,
     hits: Hits,
     view: View,
-    body: str,
-    part: str | None,
-    solid: Solid,
-    extra: Solid | None,
-    light: Light,
     rng: np.random.Generator,
+    part: str | None = None,
+    extra: Solid | None = None,
+    zone_of: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
 ) -> list[JudgePicture]:
+    """The body with something extra, or without; `part` names it, None where it is no part."""
+    catalogue, solid, light = scene.catalogue, scene.solid, scene.light
     on_part = hits.piece >= 0
     if extra is not None and on_part.sum() < LEAST_PIXELS * SUPERSAMPLING**2:
         return []
@@ -180,14 +191,14 @@ def _draw(
     film = _film(hits.pixel, np.concatenate([hits.normal @ view.to_camera.T, covered, on_part[:, None]], 1))
     alpha = film[..., 3:4]
     shares = [_patches(film[..., 4]), _patches(film[..., 3])]
-    number = NO_PART if part is None else list(PARTS).index(part)
-    body_number = list(BODIES).index(body)
+    number = NO_PART if part is None else list(catalogue.part_weights).index(part)
+    body_number = list(catalogue.body_weights).index(scene.body)
     normals = JudgePicture(
         _bytes((film[..., :3] + alpha) / 2), Claim(body_number, number, ANY_STYLE, ANY_STYLE), *shares
     )
     body_word = str(rng.choice(STYLES)) if rng.random() < 0.45 else None
-    look, style = ((), NO_STYLE) if extra is None else _part_look(part, rng)
-    zone = np.zeros_like(hits.piece) if len(look) < 2 else zones(part, hits.piece, hits.piece.max() + 1)
+    look, style = ((), NO_STYLE) if extra is None else _part_look(part, rng, catalogue)
+    zone = np.zeros_like(hits.piece) if len(look) < 2 else zone_of(hits.piece)
     paint = paint_hits(hits, solid, extra or solid, random_body_look(rng, body_word), look, zone, rng)
     linear = reflected(
         light, hits.normal, hits.to_viewer, paint.material, paint.colour, paint.roughness, paint.metallic
@@ -203,13 +214,12 @@ def _draw(
     return [normals, lit]
 
 
-def _part_look(part: str | None, rng: np.random.Generator) -> tuple[tuple[Material, ...], int]:
+def _part_look(part: str | None, rng: np.random.Generator, catalogue: Catalogue) -> tuple[tuple[Material, ...], int]:
     """Materials, and the number of the style that names them."""
     if part is None or rng.random() < 0.7:
         word = str(rng.choice(STYLES))
         return (NAMED[word],), STYLES.index(word)
-    looks = NATURAL[part]
-    style = _NATURAL_STYLE.get(part)
+    looks, style = catalogue.natural[part], catalogue.natural_styles.get(part)
     return looks[rng.integers(len(looks))], STYLES.index(style) if style else NO_STYLE
 
 
@@ -233,14 +243,19 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def render_shards(
-    folder: Path, first_seed: int, seeds: int, seeds_a_shard: int = 8, even: bool = False
+    folder: Path,
+    first_seed: int,
+    seeds: int,
+    seeds_a_shard: int = 8,
+    even: bool = False,
+    catalogue: Catalogue = COARSE,
 ) -> Iterator[Path]:
     """Write pictures as `folder/<seed>.npz`, one file for each `seeds_a_shard` seeds; files that are there are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for start in range(first_seed, first_seed + seeds, seeds_a_shard):
         path = folder / f"{start}.npz"
         if not path.is_file():
-            made = [p for seed in range(start, start + seeds_a_shard) for p in random_pictures(seed, even)]
+            made = [p for seed in range(start, start + seeds_a_shard) for p in random_pictures(seed, even, catalogue)]
             arrays = {
                 "pixels": np.stack([p.pixels for p in made]),
                 "shown": np.array([p.shown for p in made], np.int8),

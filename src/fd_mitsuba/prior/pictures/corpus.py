@@ -7,7 +7,7 @@ the edited one is the nearer of the base's and the part's hits, so a base is tra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,7 +30,11 @@ STRETCH = 0.12
 
 @dataclass(frozen=True)
 class Pair:
-    """One training example: int8 latents (4, 64, 64) in units of 1/127, its caption, and what it shows."""
+    """One training example: int8 latents (4, L, L) in units of 1/127, its caption, and what it shows.
+
+    Attributes:
+        removed: the part is in `base` and not in `edited`.
+    """
 
     base: np.ndarray
     edited: np.ndarray
@@ -39,9 +43,10 @@ class Pair:
     part: str | None
     azimuth_deg: float
     closeup: bool
+    removed: bool = field(default=False, kw_only=True)
 
     def changed(self) -> np.ndarray:
-        """Where the part is (64, 64) bool: the pixels that count most in training."""
+        """Where the part is (L, L) bool: the pixels that count most in training."""
         return np.abs(self.edited.astype(np.int16) - self.base).max(0) > 12
 
     def shows_part(self) -> bool:
@@ -97,9 +102,9 @@ class MosaicCamera:
     fov_deg: float
     target: np.ndarray
 
-    def rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rays(self, view_size: int = VIEW_SIZE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins and unit directions (4 S S, 3), and world-to-camera rotations (4, 3, 3); S = supersampled size."""
-        size = VIEW_SIZE * SUPERSAMPLING
+        size = view_size * SUPERSAMPLING
         grid = (np.arange(size) + 0.5) / size * 2 - 1
         x, y = np.meshgrid(grid, -grid)
         half = np.tan(np.deg2rad(self.fov_deg) / 2)
@@ -119,16 +124,16 @@ class MosaicCamera:
         return np.concatenate(origins), np.concatenate(directions), np.stack(rotations)
 
 
-def shade(distance: np.ndarray, normal: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """The int8 latent (4, 64, 64) of four views' hits."""
-    size, step = VIEW_SIZE * SUPERSAMPLING, SUPERSAMPLING
+def shade(distance: np.ndarray, normal: np.ndarray, rotations: np.ndarray, view_size: int = VIEW_SIZE) -> np.ndarray:
+    """The int8 latent (4, 2 view_size, 2 view_size) of four views' hits."""
+    size, step = view_size * SUPERSAMPLING, SUPERSAMPLING
     mask = np.isfinite(distance).reshape(4, size, size, 1)
     camera = np.einsum("vij,vnj->vni", rotations, normal.reshape(4, -1, 3)).reshape(4, size, size, 3) * mask
     both = np.concatenate([camera, mask], -1)
-    both = both.reshape(4, VIEW_SIZE, step, VIEW_SIZE, step, 4).mean((2, 4))
+    both = both.reshape(4, view_size, step, view_size, step, 4).mean((2, 4))
     both[..., 3] = 2 * both[..., 3] - 1
     mosaic = (
-        both.reshape(2, 2, VIEW_SIZE, VIEW_SIZE, 4).transpose(4, 0, 2, 1, 3).reshape(4, 2 * VIEW_SIZE, 2 * VIEW_SIZE)
+        both.reshape(2, 2, view_size, view_size, 4).transpose(4, 0, 2, 1, 3).reshape(4, 2 * view_size, 2 * view_size)
     )
     return np.clip(np.rint(mosaic * 127), -127, 127).astype(np.int8)
 

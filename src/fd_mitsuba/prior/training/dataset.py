@@ -1,8 +1,8 @@
 """Training pairs in files: made ahead, looked at, shared, and read again by `prior train --data`.
 
-A folder holds `dataset.json` and shards `pairs_00000.npz` (base, edited: (N, 4, 64, 64) int8 in units of 1/127;
-changed: (N, 64, 8) uint8, the part's pixels packed by `numpy.packbits`) with `pairs_00000.jsonl` beside them: a line a
-pair with its caption, body, part, first azimuth and whether it is a close-up.
+A folder holds `dataset.json` and shards `pairs_00000.npz` (base, edited: (N, 4, L, L) int8 in units of 1/127;
+changed: (N, L, L / 8) uint8, the part's pixels packed by `numpy.packbits`) with `pairs_00000.jsonl` beside them: a line
+a pair with its caption, body, part, first azimuth, whether it is a close-up and whether the part is taken away.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
-from fd_mitsuba.prior.training.train import draw_pairs
+from fd_mitsuba.prior.training.pool import draw_pairs
 
 PAIRS_A_SHARD = 256
 VIEWS_A_PAIR = 4
@@ -37,8 +37,7 @@ def build_data(
         say: takes a line a shard.
 
     Returns:
-        `pairs` that were made now, `seconds`, `pairs_per_second` (mosaics) and `views_per_second` (image pairs of
-        32 x 32).
+        `pairs` that were made now, `seconds`, `pairs_per_second` (mosaics) and `views_per_second` (image pairs).
 
     Raises:
         UserError: the folder holds data of another seed or kind.
@@ -79,7 +78,7 @@ def read_record(folder: Path) -> dict:
 
 
 class StoredPairs:
-    """All pairs of a folder in memory (33 kB each), drawn at random.
+    """All pairs of a folder in memory (33 kB each, 131 kB of the finer prior), drawn at random.
 
     Raises:
         UserError: no data there, or of another kind of prior.
@@ -135,6 +134,7 @@ def _write_shard(folder: Path, number: int, size: int, seed: int, kind: Kind) ->
             "part": pair.part,
             "azimuth_deg": round(pair.azimuth_deg, 3),
             "closeup": pair.closeup,
+            "removed": pair.removed,
         }
         for pair in pairs
     ]

@@ -1,10 +1,10 @@
-"""The two built-in priors: what each is trained on, how large its networks are, and how it wants to be fed."""
+"""The built-in priors: what each is trained on, how large its networks are, and how it wants to be fed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,23 @@ from diffusers import AutoencoderTiny
 from transformers import PreTrainedTokenizerFast
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.prior.data.captions import AZIMUTH_WORDS, CLOSEUP_WORD, word_lists
+from fd_mitsuba.prior.data.captions import AZIMUTH_WORDS, CLOSEUP_WORD
+from fd_mitsuba.prior.data.catalogue import COARSE, FINE, Catalogue
 from fd_mitsuba.prior.pictures.colour_corpus import make_colour_pairs
 from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
+from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs
 from fd_mitsuba.prior.training.model import build_text_encoder, build_unet
 from fd_mitsuba.prior.training.vae import build_vae
 from fd_mitsuba.prior.training.vae_colour import build_colour_vae
 
-_CONVENTIONS = {
+_CONVENTIONS: dict[str, Any] = {
     "view_grid": 2,
     "needs_base": True,
     "prompt_template": "{prompt}, {view} {closeup}",
     "view_words": list(AZIMUTH_WORDS),
     "closeup_word": CLOSEUP_WORD,
     "whole_words": True,
-    "vocabulary": word_lists(),
+    "vocabulary": COARSE.word_lists,
 }
 
 
@@ -36,9 +38,11 @@ class Kind:
     """A prior of one sort of picture.
 
     Attributes:
-        name: `geometry` or `appearance`.
+        name: `geometry`, `geometry_fine` or `appearance`.
+        catalogue: bodies, parts and words.
+        view_size: side in pixels of one of a mosaic's four views; the latents are twice as wide.
         make_pairs: (body, parts, seed) -> training pairs.
-        channels: of the UNet's four levels.
+        channels: of the UNet's levels, the finest first.
         norm_groups: of the UNet's group norms. As many as channels would take each channel's mean and size away, which
             normals can spare and colours cannot.
         text_width, text_layers: of the text encoder.
@@ -59,8 +63,10 @@ class Kind:
     """
 
     name: str
+    catalogue: Catalogue
+    view_size: int
     make_pairs: Callable[[str, list[str | None], int], Sequence[Pair]]
-    channels: tuple[int, int, int, int]
+    channels: tuple[int, ...]
     norm_groups: int
     text_width: int
     text_layers: int
@@ -86,7 +92,10 @@ class Kind:
         """Fresh `text_encoder` and `unet`."""
         encoder = build_text_encoder(tokenizer, self.text_width, self.text_layers)
         return torch.nn.ModuleDict(
-            {"text_encoder": encoder, "unet": build_unet(self.channels, self.text_width, self.norm_groups)}
+            {
+                "text_encoder": encoder,
+                "unet": build_unet(self.channels, self.text_width, self.norm_groups, 2 * self.view_size),
+            }
         )
 
     def save_conventions(self, folder: Path) -> None:
@@ -96,6 +105,8 @@ class Kind:
 
 GEOMETRY = Kind(
     name="geometry",
+    catalogue=COARSE,
+    view_size=32,
     make_pairs=make_pairs,
     channels=(16, 48, 96, 160),
     norm_groups=1,
@@ -114,8 +125,20 @@ GEOMETRY = Kind(
     build_vae=build_vae,
     conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference"},
 )
+GEOMETRY_FINE = replace(
+    GEOMETRY,
+    name="geometry_fine",
+    catalogue=FINE,
+    view_size=64,
+    make_pairs=make_fine_pairs,
+    channels=(16, 32, 48, 96, 160),
+    fresh_pairs=6,
+    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
+)
 APPEARANCE = Kind(
     name="appearance",
+    catalogue=COARSE,
+    view_size=32,
     make_pairs=make_colour_pairs,
     channels=(16, 32, 64, 96),
     norm_groups=1,
@@ -134,7 +157,7 @@ APPEARANCE = Kind(
     build_vae=build_colour_vae,
     conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
 )
-KINDS = {kind.name: kind for kind in (GEOMETRY, APPEARANCE)}
+KINDS = {kind.name: kind for kind in (GEOMETRY, GEOMETRY_FINE, APPEARANCE)}
 
 
 def kind_named(name: str) -> Kind:

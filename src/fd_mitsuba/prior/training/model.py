@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,13 +19,19 @@ from fd_mitsuba.prior.data.captions import vocabulary
 TEXT_WIDTH = 128
 TEXT_LENGTH = 24
 LATENT_SIZE = 64
+ATTENTION_CELLS = (16, 8)
+"""Sides of the levels with attention: above 16 x 16 cells it is what costs."""
 
 
-def build_tokenizer() -> PreTrainedTokenizerFast:
-    """A CLIP-format byte-pair tokenizer in which every word of the captions is a single token, always the same one."""
+def build_tokenizer(words: Sequence[str] | None = None) -> PreTrainedTokenizerFast:
+    """A CLIP-format byte-pair tokenizer in which every word is a single token, always the same one.
+
+    Args:
+        words: of the captions; None: the coarse prior's.
+    """
     begin, end, suffix = "<|startoftext|>", "<|endoftext|>", "</w>"
     letters = list("abcdefghijklmnopqrstuvwxyz0123456789,.-'")
-    merges = word_merges([*vocabulary(), ","], suffix)
+    merges = word_merges([*(vocabulary() if words is None else words), ","], suffix)
     tokens = [begin, end, *letters, *(letter + suffix for letter in letters), *("".join(pair) for pair in merges)]
     tokenizer = Tokenizer(
         models.BPE(
@@ -75,7 +82,11 @@ def word_merges(words: list[str], suffix: str) -> list[tuple[str, str]]:
 
 
 def load_packed(
-    packed: Path, modules: torch.nn.ModuleDict, tokenizer: PreTrainedTokenizerFast, prediction_type: str
+    packed: Path,
+    modules: torch.nn.ModuleDict,
+    tokenizer: PreTrainedTokenizerFast,
+    prediction_type: str,
+    with_unet: bool = True,
 ) -> None:
     """Load the weights of a packed pipeline folder into `modules` (`text_encoder`, `unet`).
 
@@ -91,6 +102,8 @@ def load_packed(
         if token in old:
             embedding[index] = text[key][old[token]]
     modules["text_encoder"].load_state_dict({**text, key: embedding})
+    if not with_unet:
+        return
     modules["unet"].load_state_dict(load_file(packed / "unet" / "diffusion_pytorch_model.safetensors"))
     before = json.loads((packed / "scheduler" / "scheduler_config.json").read_text(encoding="utf-8"))["prediction_type"]
     if {before, prediction_type} == {"v_prediction", "sample"}:
@@ -118,17 +131,21 @@ def build_text_encoder(tokenizer: PreTrainedTokenizerFast, width: int = TEXT_WID
 
 
 def build_unet(
-    channels: tuple[int, int, int, int] = (16, 48, 96, 160), text_width: int = TEXT_WIDTH, norm_groups: int = 16
+    channels: tuple[int, ...] = (16, 48, 96, 160),
+    text_width: int = TEXT_WIDTH,
+    norm_groups: int = 16,
+    latent_size: int = LATENT_SIZE,
 ) -> UNet2DConditionModel:
     """The denoiser: 8 channels in (noisy latent, condition's latent), 4 out, attention at 16 and 8 cells a side."""
+    attends = [latent_size >> level in ATTENTION_CELLS for level in range(len(channels))]
     return UNet2DConditionModel(
-        sample_size=LATENT_SIZE,
+        sample_size=latent_size,
         in_channels=8,
         out_channels=4,
         layers_per_block=1,
         block_out_channels=channels,
-        down_block_types=("DownBlock2D", "DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
-        up_block_types=("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D", "UpBlock2D"),
+        down_block_types=tuple("CrossAttnDownBlock2D" if yes else "DownBlock2D" for yes in attends),
+        up_block_types=tuple("CrossAttnUpBlock2D" if yes else "UpBlock2D" for yes in reversed(attends)),
         cross_attention_dim=text_width,
         attention_head_dim=4,
         norm_num_groups=norm_groups,

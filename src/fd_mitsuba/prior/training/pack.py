@@ -26,7 +26,8 @@ def pack(checkpoint: Path, folder: Path) -> None:
     if state.get("kind") == clip_train.KIND:
         clip_train.pack_evaluator(state, folder)
         return
-    kind, tokenizer = kind_named(state.get("kind", GEOMETRY.name)), build_tokenizer()
+    kind = kind_named(state.get("kind", GEOMETRY.name))
+    tokenizer = build_tokenizer(kind.catalogue.vocabulary)
     modules = kind.build_modules(tokenizer)
     missing = modules.load_state_dict(state["average"], strict=False).missing_keys
     if any("position_ids" not in key for key in missing):

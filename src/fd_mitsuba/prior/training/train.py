@@ -3,88 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d
 
 from fd_mitsuba.errors import Interrupted, UserError
-from fd_mitsuba.prior.data.bodies import BODIES
-from fd_mitsuba.prior.data.captions import HELD_OUT
-from fd_mitsuba.prior.data.parts import PARTS
-from fd_mitsuba.prior.pictures.corpus import Pair
 from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
-from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, load_packed, tokenize
+from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, tokenize
+from fd_mitsuba.prior.training.pool import Pairs, Pool, WorkerPool
 from fd_mitsuba.prior.training.replicas import Replicas
 from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow, smoothed
+from fd_mitsuba.prior.training.warm_start import load_start
 from fd_mitsuba.training.stop_request import stop_on_signals
 
-OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person", "rabbit", "cow", "vase")
-"""Bodies that most pictures show; the others keep the copying of the base general."""
-_BODY_SHARES = np.array([4.0 if name in OFTEN else 1.0 for name in BODIES])
-_BODY_SHARES /= _BODY_SHARES.sum()
-PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0) | dict.fromkeys(
-    ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
-)
-"""How much more often than the others the parts of few pixels are drawn, and those that come out worst."""
 LOG_EVERY = 50
 ShareLoss = tuple[torch.Tensor, torch.Tensor]
-
-
-def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
-    """The pairs of one random body with four of its parts, and in half of the cases of the body alone.
-
-    None is of `HELD_OUT`, and none has a part that the views hardly show: it would teach that the word means nothing.
-    """
-    body = str(rng.choice(list(BODIES), p=_BODY_SHARES))
-    allowed = [part for part in PARTS if (body, part) not in HELD_OUT]
-    shares = np.array([PART_SHARES.get(part, 1.0) for part in allowed])
-    drawn = rng.choice(len(allowed), size=4, replace=False, p=shares / shares.sum())
-    parts: list[str | None] = [allowed[i] for i in drawn]
-    if rng.random() < 0.5:
-        parts.append(None)
-    pairs = kind.make_pairs(body, parts, int(rng.integers(2**31)))
-    return [pair for pair in pairs if pair.part is None or pair.shows_part()]
-
-
-class Pairs(Protocol):
-    """Where the training's batches come from: rendered as they are needed (`Pool`), or `dataset.StoredPairs`."""
-
-    def refresh(self, count: int) -> None:
-        """Bring `count` more pairs in, if that is how it works."""
-
-    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
-        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
-        ...
-
-
-class Pool:
-    """The most recent pairs; every call to `refresh` renders one more body with a few of its parts."""
-
-    def __init__(self, kind: Kind, seed: int, capacity: int = 6000) -> None:
-        self._kind, self._owed = kind, 0
-        self._rng = np.random.default_rng(seed)
-        self._pairs: deque[Pair] = deque(maxlen=capacity)
-
-    def refresh(self, count: int) -> None:
-        """Render until `count` more pairs are there; what a body gives beyond that counts for the next call."""
-        self._owed += count
-        while self._owed > 0:
-            made = draw_pairs(self._kind, self._rng)
-            self._pairs.extend(made)
-            self._owed -= len(made)
-
-    def batch(self, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]:
-        """Base and edited latents (size, 4, 64, 64) in [-1, 1], the part's pixels (size, 1, 64, 64), and captions."""
-        chosen = [self._pairs[i] for i in self._rng.integers(len(self._pairs), size=size)]
-        base = torch.from_numpy(np.stack([p.base for p in chosen])).float() / 127
-        edited = torch.from_numpy(np.stack([p.edited for p in chosen])).float() / 127
-        changed = torch.from_numpy(np.stack([p.changed() for p in chosen])).float()[:, None]
-        return base, edited, changed, [p.caption for p in chosen]
 
 
 def train(
@@ -98,6 +34,8 @@ def train(
     init: Path | None = None,
     pairs: Pairs | None = None,
     half: bool = False,
+    device: str = "cpu",
+    workers: int = 0,
 ) -> None:
     """Train until `total_steps` or for `seconds`, whichever is first; continue from `folder` if it holds a checkpoint.
 
@@ -105,19 +43,23 @@ def train(
         folder: checkpoints and log; written every five minutes and at the end.
         kind: which prior.
         total_steps: length of the schedule; None: the kind's own.
-        init: optional folder of packed weights to start from instead of random ones; no step is small then.
+        init: optional folder of packed weights to start from instead of random ones; no step is small then. A coarser
+            prior's start a finer one, see `warm_start`.
         pairs: what to train on instead of freshly rendered pictures.
         half: multiply in bfloat16: faster on a processor that has it, slower on others.
+        device: where the networks are, as torch names it; noise and times are drawn there.
+        workers: processes that render pictures beside the training; 0: it renders them itself, between its steps.
     """
     total_steps = kind.steps if total_steps is None else total_steps
     files = TrainingFolder(folder)
     torch.manual_seed(seed)
     scheduler, state = build_scheduler(kind.prediction), files.load()
-    tokenizer = build_tokenizer()
-    modules = kind.build_modules(tokenizer)
-    modules["unet"].to(memory_format=torch.channels_last)
+    tokenizer = build_tokenizer(kind.catalogue.vocabulary)
+    modules, place = kind.build_modules(tokenizer), torch.device(device)
     if init is not None and state is None:
-        load_packed(init, modules, tokenizer, kind.prediction)
+        load_start(init, modules, tokenizer, kind.prediction)
+    modules.to(place)
+    modules["unet"].to(memory_format=torch.channels_last)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     optimiser = torch.optim.AdamW(
         modules.parameters(), lr=kind.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
@@ -135,12 +77,15 @@ def train(
             )
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
-        average, step, before = state["average"], state["step"], state.get("seconds", 0.0)
+        average = {key: value.to(place) for key, value in state["average"].items()}
+        step, before = state["step"], state.get("seconds", 0.0)
         small_steps = state.get("small_steps", kind.small_steps)
-    replicas = Replicas(modules, min(torch.get_num_threads(), batch_size))
-    alphas = scheduler.alphas_cumprod
-    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    pool = Pool(kind, seed * 7919 + step) if pairs is None else pairs
+    replicas = Replicas(modules, min(torch.get_num_threads(), batch_size) if place.type == "cpu" else 1)
+    alphas = scheduler.alphas_cumprod.to(place)
+    generator = torch.Generator(place).manual_seed(seed * 1_000_003 + step)
+    own_seed = seed * 7919 + step
+    crew = WorkerPool(kind, own_seed, workers) if workers and pairs is None else None
+    pool = crew or pairs or Pool(kind, own_seed)
     pool.refresh(min(600, total_steps * batch_size))
     started, smooth = time.time(), None
 
@@ -156,24 +101,29 @@ def train(
             rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
             for group in optimiser.param_groups:
                 group["lr"] = rate
-            base, edited, changed, captions = pool.batch(batch_size)
+            *pictures, captions = pool.batch(batch_size)
+            base, edited, changed = (picture.to(place, non_blocking=True) for picture in pictures)
             if step < small_steps:
                 base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
                 changed = (avg_pool2d(changed, 2) > 0.4).float()
-            draw = torch.rand(batch_size, generator=generator).tolist()
+            draw = torch.rand(batch_size, generator=generator, device=place).tolist()
             captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
-            keep_base = torch.tensor([0.0 if 0.06 < u < 0.14 else 1.0 for u in draw])[:, None, None, None]
-            times = (1000 * torch.rand(batch_size, generator=generator) ** kind.time_power).long().clamp(max=999)
-            noise = torch.randn(edited.shape, generator=generator)
+            keep_base = torch.tensor([0.0 if 0.06 < u < 0.14 else 1.0 for u in draw], device=place)[:, None, None, None]
+            times = (
+                (1000 * torch.rand(batch_size, generator=generator, device=place) ** kind.time_power)
+                .long()
+                .clamp(max=999)
+            )
+            noise = torch.randn(edited.shape, generator=generator, device=place)
             if kind.masked_noise:
-                masked = torch.rand(batch_size, generator=generator) < kind.masked_noise
+                masked = torch.rand(batch_size, generator=generator, device=place) < kind.masked_noise
                 noise = torch.where(masked[:, None, None, None], noise * changed, noise)
             a = alphas[times][:, None, None, None]
             noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
             target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
             condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
             kept = base * keep_base if kind.difference else torch.zeros_like(edited)
-            batch = condition, times, tokenize(tokenizer, captions), target - kept, changed
+            batch = condition, times, tokenize(tokenizer, captions).to(place), target - kept, changed
 
             def share(modules: torch.nn.ModuleDict, samples: slice, batch: Sequence[torch.Tensor] = batch) -> ShareLoss:
                 return share_loss(modules, kind, half, *(values[samples] for values in batch))
@@ -184,8 +134,8 @@ def train(
             optimiser.zero_grad(set_to_none=True)
             step += 1
             follow(average, modules, min(0.998, step / (step + 10)))
-            on_part = ((error * changed).sum() / (4 * changed.sum() + 1)).item()
-            smooth = smoothed(smooth, (error.mean().item(), on_part), 0.98)
+            on_part = (error * changed).sum() / (4 * changed.sum() + 1)
+            smooth = smoothed(smooth, tuple(torch.stack([error.mean(), on_part]).tolist()), 0.98)
             pool.refresh(kind.fresh_pairs)
             if step % LOG_EVERY == 0:
                 line = {
@@ -199,6 +149,8 @@ def train(
             if files.is_due():
                 save()
     save()
+    if crew is not None:
+        crew.close()
     if stop.name is not None:
         raise Interrupted(f"{stop.name}: stopped after step {step} of {total_steps}; the same command goes on")
 
@@ -214,7 +166,7 @@ def share_loss(
     changed: torch.Tensor,
 ) -> ShareLoss:
     """Mean loss of some samples, and the errors' squares (N, 4, H, W), detached."""
-    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+    with torch.autocast(condition.device.type, torch.bfloat16, enabled=half):
         words = modules["text_encoder"](tokens).last_hidden_state
         away = modules["unet"](condition, times, words).sample.float() - wanted
     error = squared_error(away, kind.tint_weight)

@@ -1,0 +1,114 @@
+"""Training mosaics of the finer prior: views of 64 pixels, parts added, taken away, and beside parts that stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fd_mitsuba.prior.data.body import Body
+from fd_mitsuba.prior.data.captions import view_words
+from fd_mitsuba.prior.data.fine.bodies import BODIES
+from fd_mitsuba.prior.data.fine.captions import caption
+from fd_mitsuba.prior.data.fine.parts import PARTS
+from fd_mitsuba.prior.data.fine.placement import varied
+from fd_mitsuba.prior.data.fine.surface import Surface
+from fd_mitsuba.prior.data.primitives import join, transform
+from fd_mitsuba.prior.pictures.corpus import (
+    MosaicCamera,
+    Pair,
+    RayCaster,
+    closeup_camera,
+    global_camera,
+    random_stretch,
+    shade,
+)
+
+VIEW_SIZE = 64
+LEAST_PIXELS = 40
+"""Of a mosaic that a part must change to be seen at all."""
+REMOVED_SHARE = 0.1
+"""Pairs the other way round: the body with the part is the condition, the bare body what is wanted."""
+BESIDE_SHARE = 0.12
+"""Pairs whose body wears another part, before and after."""
+Hits = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class FinePair(Pair):
+    """A pair of views of 64 pixels; latents are (4, 128, 128). `beside` names a part that both show."""
+
+    beside: str | None = field(default=None, kw_only=True)
+
+    def shows_part(self) -> bool:
+        return bool(self.changed().sum() >= LEAST_PIXELS)
+
+
+def stretched(body: Body, factors: np.ndarray) -> Body:
+    """The body and its anchors, longer or shorter along the axes by `factors` (3,)."""
+    across = float(np.sqrt(factors[0] * factors[2]))
+    direction = factors * body.horn_direction
+    return replace(
+        body,
+        solid=transform(body.solid, np.diag(factors)),
+        head_top=factors * body.head_top,
+        forehead=factors * body.forehead,
+        back=factors * body.back,
+        side=factors * body.side,
+        horn_direction=direction / np.linalg.norm(direction),
+        head_radius=across * body.head_radius,
+        back_half_width=factors[0] * body.back_half_width,
+        reach=float(np.prod(factors) ** (1 / 3)) * body.reach,
+        side_height=factors[1] * body.side_height,
+        bottom=factors[1] * body.bottom,
+        foot_x=factors[0] * body.foot_x,
+        foot_z=factors[2] * body.foot_z,
+        foot_centre_z=factors[2] * body.foot_centre_z,
+    )
+
+
+def nearer(first: Hits, second: Hits) -> Hits:
+    """What a ray sees of two solids."""
+    closer = second[0] < first[0]
+    return np.where(closer, second[0], first[0]), np.where(closer[:, None], second[1], first[1])
+
+
+def make_fine_pairs(body: str, parts: list[str | None], seed: int) -> list[FinePair]:
+    """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
+    rng = np.random.default_rng([seed, list(BODIES).index(body)])
+    surface = Surface(stretched(BODIES[body](rng), np.diag(random_stretch(rng))))
+    overview = global_camera(rng)
+    overview_rays = overview.rays(VIEW_SIZE)
+    overview_hits = surface.caster.cast(*overview_rays[:2])
+    pairs: list[FinePair] = []
+    before: tuple[str, RayCaster] | None = None
+
+    def add(
+        camera: MosaicCamera, rays: tuple, base: Hits, own: RayCaster | None, part: str | None, closeup: bool
+    ) -> None:
+        beside = None
+        if before is not None and before[0] != part and rng.random() < BESIDE_SHARE:
+            beside, base = before[0], nearer(base, before[1].cast(*rays[:2]))
+        edited = base if own is None else nearer(base, own.cast(*rays[:2]))
+        removed = part is not None and rng.random() < REMOVED_SHARE
+        words = f"{caption(body, part, rng, removed)}, {view_words(camera.azimuth_deg, closeup)}"
+        first, second = (shade(*hits, rays[2], VIEW_SIZE) for hits in (base, edited))
+        if removed:
+            first, second = second, first
+        view = camera.azimuth_deg, closeup
+        pairs.append(FinePair(first, second, words, body, part, *view, removed=removed, beside=beside))
+
+    for part in parts:
+        zones = {} if part is None else PARTS[part](surface, rng)
+        if not zones:
+            add(overview, overview_rays, overview_hits, None, None, False)
+            continue
+        assert part is not None
+        solid = varied(part, join(list(zones.values())), surface, rng)
+        own = RayCaster(solid)
+        add(overview, overview_rays, overview_hits, own, part, False)
+        near = closeup_camera(solid, rng)
+        rays = near.rays(VIEW_SIZE)
+        add(near, rays, surface.caster.cast(*rays[:2]), own, part, True)
+        before = part, own
+    return pairs

@@ -1,0 +1,124 @@
+"""Where a training's batches come from: the most recent of freshly rendered pairs, made here or by worker processes."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import queue
+from collections import deque
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.prior.pictures.corpus import Pair
+from fd_mitsuba.prior.training.kinds import Kind, kind_named
+
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[str]]
+_QUEUED = 64
+_PATIENCE_SECONDS = 120.0
+
+
+def draw_pairs(kind: Kind, rng: np.random.Generator) -> Sequence[Pair]:
+    """The pairs of one random body with four of its parts, and in half of the cases of the body alone.
+
+    None is one that the catalogue leaves out, and none has a part that the views hardly show: it would teach that
+    the word means nothing.
+    """
+    body, parts = kind.catalogue.draw(rng)
+    pairs = kind.make_pairs(body, parts, int(rng.integers(2**31)))
+    return [pair for pair in pairs if pair.part is None or pair.shows_part()]
+
+
+class Pairs(Protocol):
+    """Where the training's batches come from: rendered as they are needed (`Pool`), or `dataset.StoredPairs`."""
+
+    def refresh(self, count: int) -> None:
+        """Bring `count` more pairs in, if that is how it works."""
+
+    def batch(self, size: int) -> Batch:
+        """Base and edited latents (size, 4, L, L) in [-1, 1], the part's pixels (size, 1, L, L), and captions."""
+        ...
+
+
+class Pool:
+    """The most recent pairs; every call to `refresh` renders one more body with a few of its parts."""
+
+    def __init__(self, kind: Kind, seed: int, capacity: int = 6000) -> None:
+        self._kind, self._owed = kind, 0
+        self._rng = np.random.default_rng(seed)
+        self._pairs: deque[Pair] = deque(maxlen=capacity)
+
+    def refresh(self, count: int) -> None:
+        """Render until `count` more pairs are there; what a body gives beyond that counts for the next call."""
+        self._owed += count
+        while self._owed > 0:
+            made = draw_pairs(self._kind, self._rng)
+            self._pairs.extend(made)
+            self._owed -= len(made)
+
+    def batch(self, size: int) -> Batch:
+        """As `Pairs.batch`."""
+        chosen = [self._pairs[i] for i in self._rng.integers(len(self._pairs), size=size)]
+        base = torch.from_numpy(np.stack([p.base for p in chosen])).float() / 127
+        edited = torch.from_numpy(np.stack([p.edited for p in chosen])).float() / 127
+        changed = torch.from_numpy(np.stack([p.changed() for p in chosen])).float()[:, None]
+        return base, edited, changed, [p.caption for p in chosen]
+
+
+class WorkerPool(Pool):
+    """A pool that processes fill beside the training, as fast as they can: a GPU must not wait for pictures.
+
+    Which pairs are there at a step depends on the machine, so that only a training with `Pool` follows from its seed.
+
+    Args:
+        workers: processes; each renders on one core, from seeds of its own.
+    """
+
+    def __init__(self, kind: Kind, seed: int, workers: int, capacity: int = 20000) -> None:
+        super().__init__(kind, seed, capacity)
+        context = multiprocessing.get_context("spawn")  # a forked process would share Mitsuba's threads
+        self._queue = context.Queue(_QUEUED)
+        self._processes = [
+            context.Process(target=_fill, args=(self._queue, kind.name, seed, number), daemon=True)
+            for number in range(workers)
+        ]
+        for process in self._processes:
+            process.start()
+
+    def refresh(self, count: int) -> None:
+        """Take in what the workers have made; waits only while there are less than `count` pairs in all.
+
+        Raises:
+            UserError: the workers have stopped.
+        """
+        for _ in range(_QUEUED):
+            self._take(0.0)
+        while len(self._pairs) < count:
+            self._take(_PATIENCE_SECONDS)
+
+    def _take(self, seconds: float) -> None:
+        """Add what a worker has made, if there is something within that time."""
+        with contextlib.suppress(queue.Empty):
+            self._pairs.extend(self._queue.get(timeout=seconds))
+            return
+        if not any(process.is_alive() for process in self._processes):
+            raise UserError("--workers: the processes that render pictures have stopped; see above")
+
+    def close(self) -> None:
+        """End the workers."""
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            process.join()
+
+
+def _fill(pairs: multiprocessing.Queue, kind_name: str, seed: int, number: int) -> None:
+    from fd_mitsuba.backend.threads import share_cores
+
+    share_cores(1)
+    kind, rng = kind_named(kind_name), np.random.default_rng([seed, number, 1])
+    while True:
+        pairs.put(draw_pairs(kind, rng))
