@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 STAGES = ("geometry", "appearance")
 
 
+def demo_scene() -> Path:
+    """Path of the scene that ships with the package: a cat, and a focal region for a crown above its head.
+
+    Example:
+        scene = fd.load_scene(fd.demo_scene(), prompt="a cat with a pointed hat")
+    """
+    return Path(__file__).with_name("demo") / "cat" / "scene.xml"
+
+
 def load_scene(
     path: Path | str,
     parameters: Mapping[str, str] | None = None,

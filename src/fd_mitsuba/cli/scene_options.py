@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 def scene_options(parser: argparse.ArgumentParser) -> None:
     """The scene, -D, --prompt, --regions, and the machine's options."""
     parser.add_argument("scene", help="Mitsuba scene file (XML)")
+    scene_changes(parser)
+
+
+def scene_changes(parser: argparse.ArgumentParser) -> None:
+    """All of `scene_options` but the scene itself."""
     parser.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
     )
