@@ -1,6 +1,8 @@
 # Everything runs in .venv, which the first target that needs it creates.
 #   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
 #   make test                              all fast tests (minutes); PYTEST_ARGS="-k union -x" narrows them down
+#   make docs                              the documentation site, into build/site
+#   make wheel                             builds the wheel and tries it outside the repository
 #   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
@@ -14,7 +16,7 @@ PYTEST_ARGS ?=
 PY := .venv/bin/python
 STAMP := .venv/.installed
 
-.PHONY: demo test bench lint clean install llvm
+.PHONY: demo test docs wheel bench lint clean install llvm
 .DEFAULT_GOAL := demo
 
 install: $(STAMP)
@@ -39,6 +41,13 @@ bench: $(STAMP) llvm
 	$(PY) benchmarks/appearance_step.py --json
 	$(PY) benchmarks/export_part.py --json
 	$(PY) benchmarks/guidance_call.py --json
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	@echo "open build/site/index.html"
+
+wheel: $(STAMP) llvm
+	PYTHON=$(PY) bash tools/check_wheel.sh
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
