@@ -55,7 +55,6 @@ def _written(action: argparse.Action) -> str:
     value = action.metavar or (
         "{" + ",".join(map(str, action.choices)) + "}" if action.choices is not None else action.dest.upper()
     )
-    value = str(value).replace("|", "\\|")
     if not action.option_strings:
         return f"`{value}`"
     return ", ".join(f"`{option}`" for option in action.option_strings) + ("" if action.nargs == 0 else f" `{value}`")
