@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 WIDTH = 120
 _ITEM = re.compile(r"^(\s*)([-*+]|\d+[.)])\s+")
 _FENCE = re.compile(r"^\s*(```|~~~)")
-_BEGINS = re.compile(r"^\s*(#|\||<|>|:::|\[[^\]]+\]:\s|!\[.*\)$|\$\$|---+\s*$)")
+_BEGINS = re.compile(r"^\s*(#{1,6}\s|\||<|>|:::|\[[^\]]+\]:\s|!\[.*\)$|\$\$|---+\s*$)")
 """Lines that are no prose, or that a break must not be moved across."""
 
 
@@ -90,7 +90,7 @@ def _laid(block: list[str]) -> list[str]:
 def _glued(words: str) -> str:
     """Blanks within code and link texts' brackets do not break, nor does one before a word that would begin a list."""
     words = re.sub(r"`[^`]*`", lambda match: match[0].replace(" ", "\0"), words)
-    return re.sub(r" (?=([-*+#>|]|\d+[.)]) )", "\0", words)
+    return re.sub(r" (?=(?:[-*+>|]|\d+[.)]) |#)", "\0", words)
 
 
 def main() -> int:
