@@ -51,6 +51,7 @@ wheel: $(STAMP) llvm
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
+	$(PY) -m ruff format --check --quiet .
 
 clean:
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

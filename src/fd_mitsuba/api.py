@@ -65,7 +65,7 @@ def load_scene(
 
     words = None if prompt is None else " ".join(prompt.split())
     if words == "":
-        raise UserError("prompt: is blank; say what the edited object looks like")
+        raise UserError("prompt: is blank; describe the edited object")
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
     share_cores(threads, variant)
@@ -85,7 +85,7 @@ def edit(
     quiet: bool = False,
     stages: Collection[str] = STAGES,
     geometry_from: Path | str | None = None,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
     command: str = "",
 ) -> Run:
     """Grow the part that a scene asks for, give it its material, write the run folder with all exports and its report.
@@ -98,39 +98,39 @@ def edit(
             name. With `guide_appearance` it serves the appearance stage as well.
         on_step: called with a `StepUpdate` after each finished step.
         resume: go on with the run in `output`.
-        quiet: no progress display, no remarks.
+        quiet: no progress display, no log lines.
         stages: which of `geometry` and `appearance` to run.
         geometry_from: another run of this scene, whose finished geometry is taken over.
-        say: takes remarks, a line each; None: they go to stderr unless `quiet`.
+        log: takes log lines and warnings; None: they go to stderr unless `quiet`.
         command: for the record in the run folder.
 
     Raises:
         UserError: bad input; `RunStopped` if a run cannot go on, `Interrupted` after SIGINT or SIGTERM.
     """
-    if say is None:
-        say = _nothing if quiet else _to_stderr
+    if log is None:
+        log = _nothing if quiet else _to_stderr
     if isinstance(scene, (str, Path)):
         scene = load_scene(scene)
     if config is None:
         chosen = settings_for_run(None)
         config = chosen.config
-        say(str(chosen.remark))
+        log(str(chosen.remark))
     unknown = set(stages) - set(STAGES)
     if unknown or not stages:
         raise UserError(f"stages = {sorted(stages)}: give any of {', '.join(STAGES)}")
     if guidance is None:
         for line in misfits(config):
-            say(f"warning: {line}")
+            log(f"warning: {line}")
     from fd_mitsuba.evaluation.report.run_page import reported
     from fd_mitsuba.runs.pipeline import run
 
     folder = Path(output)
     taken = None if geometry_from is None else Path(geometry_from)
-    with reported(folder, say):
-        run(scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step)
+    with reported(folder, log):
+        run(scene, config, folder, resume, command, quiet, log, tuple(stages), taken, guidance, on_step)
     result = Run(folder)
     for warning in result.warnings:
-        say(f"warning: {warning}")
+        log(f"warning: {warning}")
     return result
 
 

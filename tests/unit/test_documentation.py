@@ -80,6 +80,7 @@ def test_the_commands_page_has_every_command_and_option() -> None:
         section = page.split(f"\n## fd_mitsuba {name}\n")[1].split("\n## ")[0]
         for action in parser._actions:
             assert all(f"`{option}`" in section for option in action.option_strings if option not in ("-h", "--help"))
+    assert not [line for line in page.splitlines() if line.startswith("| `") and line.endswith("|  |")], "without help"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])

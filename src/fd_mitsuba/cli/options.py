@@ -1,4 +1,4 @@
-"""What several commands have in common: options of the machine, `-D`, remarks, the start of Mitsuba."""
+"""What several commands have in common: options of the machine, `-D`, lines on stderr, the start of Mitsuba."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def machine_options(parser: argparse.ArgumentParser) -> None:
 
 
 def remark(line: str) -> None:
-    """Say something on stderr."""
+    """Print a line on stderr."""
     print(f"fd_mitsuba: {line}", file=sys.stderr)
 
 
@@ -37,7 +37,7 @@ def definitions(options: argparse.Namespace) -> dict[str, str]:
 
 
 def start(options: argparse.Namespace) -> None:
-    """Start Mitsuba as the options say."""
+    """Start Mitsuba by the options."""
     quiet_libraries(options)
     from fd_mitsuba.backend.threads import share_cores
 

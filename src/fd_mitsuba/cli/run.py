@@ -46,12 +46,12 @@ def run_scene(options: argparse.Namespace) -> int:
         quiet=options.quiet,
         stages=STAGES if options.stage == "all" else (options.stage,),
         geometry_from=options.geometry_from,
-        say=remark,
+        log=remark,
         command=options.command_line,
     )
     metrics = run.metrics
     picture = "appearance" if "appearance" in metrics else "turntable"
-    print(f"{run.folder}: part in export/, pictures in images/{picture}.png, all in report.html")
+    print(f"{run.folder}: part in export/, images in images/{picture}.png, all in report.html")
     print(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
         f"base identical: {metrics['base_identical']}, {metrics['seconds']:.0f} s"

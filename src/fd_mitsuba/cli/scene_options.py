@@ -46,7 +46,7 @@ def settings_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_settings(options: argparse.Namespace) -> RunConfig:
-    """The settings that the options ask for; how they were chosen, where the options do not say, goes to stderr."""
+    """The settings that the options ask for; how they were chosen where no option does goes to stderr."""
     from fd_mitsuba.config import settings_for_run
 
     chosen = settings_for_run(options.config, options.overrides)
@@ -56,7 +56,7 @@ def chosen_settings(options: argparse.Namespace) -> RunConfig:
 
 
 def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:
-    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `api.load_scene`."""
+    """The scene, with Mitsuba started by the options; `on_misplaced` as in `api.load_scene`."""
     parameters = definitions(options)
     quiet_libraries(options)
     from fd_mitsuba.api import load_scene

@@ -265,4 +265,4 @@ class OutputConfig(Section):
     turntable_size: Annotated[int, Field(ge=16)] = 256
     """Pixels a side of a turntable."""
     texture_size: Annotated[int, Field(ge=16, le=8192)] = 1024
-    """Texels a side of each exported part's pictures."""
+    """Texels a side of each exported part's textures."""
