@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import argparse
 import re
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 WIDTH = 120
+FOLDERS = ("benchmarks", "docs", "examples", "scenes", "src", "tests", "tools")
 _ITEM = re.compile(r"^(\s*)([-*+]|\d+[.)])\s+")
 _FENCE = re.compile(r"^\s*(```|~~~)")
 _BEGINS = re.compile(r"^\s*(#{1,6}\s|\||<|>|:::|\[[^\]]+\]:\s|!\[.*\)$|\$\$|---+\s*$)")
@@ -54,10 +54,8 @@ def too_long(text: str, tables: bool = False) -> list[int]:
 
 def markdown_files() -> list[Path]:
     """The repository's own Markdown files; the notices of a bundled library keep their form."""
-    named = subprocess.run(
-        ["git", "ls-files", "-z", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    return [ROOT / name for name in named.split("\0") if name and "model_viewer" not in name]
+    found = [*ROOT.glob("*.md"), *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.md"))]
+    return sorted(path for path in found if not {"node_modules", "model_viewer"} & set(path.parts))
 
 
 def _is_code(line: str, before: list[str]) -> bool:
@@ -95,7 +93,7 @@ def _glued(words: str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("files", nargs="*", type=Path, help="default: all that git knows")
+    parser.add_argument("files", nargs="*", type=Path, help="default: all of the repository's")
     parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if a line is too long")
     parser.add_argument("--tables", action="store_true", help="rows of tables count, too")
     options = parser.parse_args()
