@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
+from pydantic import Field
 
 import fd_mitsuba
 from fd_mitsuba.api import demo_scene
@@ -17,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 sys.path += [str(ROOT / "tools"), str(ROOT / "tools" / "site")]
 
 from commands_page import commands_page  # noqa: E402
-from settings_page import descriptions, settings_page  # noqa: E402
+from settings_page import descriptions, settings_page, table  # noqa: E402
 from wrap_markdown import markdown_files, too_long, wrapped  # noqa: E402
 
 SECTIONS = {
@@ -70,6 +72,28 @@ def test_the_settings_page_has_every_setting_with_its_range_and_values() -> None
     assert cells.split(" | ")[1:5] == ["integer ≥ 8, ≤ 256", "`64`", "", ""]
     steps = next(line for line in rows if line.startswith("| `steps` | integer ≥ 1 | `3000`"))
     assert steps.split(" | ")[3] == "`400`"
+
+
+class MayChange:
+    def __repr__(self) -> str:
+        return "MAY_CHANGE"
+
+
+class Marked(Section):
+    pace: Annotated[int, Field(ge=1), MayChange()] = 3
+    """How often."""
+    shape: Literal["round", "flat"] | None = None
+    """Which."""
+
+
+def test_a_row_tells_values_meaning_and_whether_a_resumed_run_takes_another() -> None:
+    rows = table(
+        Marked, ["pace", "shape"], {"quick": {"pace": 3, "shape": "flat"}, "paper": {"pace": 5, "shape": None}}
+    )
+    assert rows.splitlines()[2:] == [
+        "| `pace` | integer ≥ 1 | `3` |  | `5` | How often. May change on `--resume`. |",
+        '| `shape` | `"round"` or `"flat"` or none | `none` | `"flat"` |  | Which. |',
+    ]
 
 
 def test_the_commands_page_has_every_command_and_option() -> None:

@@ -36,7 +36,7 @@ def settings_page() -> str:
             sections.append(_section(name, field.annotation, {key: run[name] for key, run in shipped.items()}))
         else:
             top.append(name)
-    whole = _table(RunConfig, top, shipped)
+    whole = table(RunConfig, top, shipped)
     return "\n".join([HEADER, "## Outside of sections\n", whole, *sections])
 
 
@@ -67,10 +67,11 @@ def _is_constant(node: ast.stmt) -> bool:
 
 def _section(name: str, model: type[BaseModel], shipped: dict[str, dict]) -> str:
     about = inspect.cleandoc(model.__dict__.get("__doc__") or "")
-    return "\n".join([f"\n## `[{name}]`\n", f"{about}\n", _table(model, list(model.model_fields), shipped)])
+    return "\n".join([f"\n## `[{name}]`\n", f"{about}\n", table(model, list(model.model_fields), shipped)])
 
 
-def _table(model: type[BaseModel], names: list[str], shipped: dict[str, dict]) -> str:
+def table(model: type[BaseModel], names: list[str], shipped: dict[str, dict]) -> str:
+    """The rows of some settings of a model; `shipped` has the values of each column by its name."""
     schema, meaning, usual = model.model_json_schema(), descriptions(model), model().model_dump(mode="json")
     rows = ["| setting | values | default | quick | paper | meaning |", "|---|---|---|---|---|---|"]
     for name in names:
@@ -78,6 +79,8 @@ def _table(model: type[BaseModel], names: list[str], shipped: dict[str, dict]) -
         values = " | ".join("" if other == default else f"`{_toml(other)}`" for other in others)
         kind = _kind(schema["properties"][name], schema.get("$defs", {}))
         about = " ".join(meaning.get(name, "").split()).replace("|", "\\|")
+        if "MAY_CHANGE" in map(repr, model.model_fields[name].metadata):
+            about += " May change on `--resume`."
         rows.append(f"| `{name}` | {kind} | `{_toml(default)}` | {values} | {about} |")
     return "\n".join(rows) + "\n"
 
