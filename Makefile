@@ -2,6 +2,8 @@
 #   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
 #   make test                              all fast tests (minutes); PYTEST_ARGS="-k union -x" narrows them down
 #   make fuzz N=5000 SEED=1           spoiled inputs, and a table of how the command line takes them
+#   make docs                              the documentation site, into build/site
+#   make wheel                             builds the wheel and tries it outside the repository
 #   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
@@ -17,7 +19,7 @@ SEED ?= 0
 PY := .venv/bin/python
 STAMP := .venv/.installed
 
-.PHONY: demo test fuzz bench lint clean install llvm
+.PHONY: demo test fuzz docs wheel bench lint clean install llvm
 .DEFAULT_GOAL := demo
 
 install: $(STAMP)
@@ -46,8 +48,16 @@ bench: $(STAMP) llvm
 	$(PY) benchmarks/export_part.py --json
 	$(PY) benchmarks/guidance_call.py --json
 
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	@echo "open build/site/index.html"
+
+wheel: $(STAMP) llvm
+	PYTHON=$(PY) bash tools/check_wheel.sh
+
 lint: $(STAMP)
 	$(PY) -m ruff check .
+	$(PY) -m ruff format --check --quiet .
 
 clean:
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fd_mitsuba.api import Run, edit, evaluate, load_scene
+    from fd_mitsuba.api import Run, demo_scene, edit, evaluate, load_scene
     from fd_mitsuba.config import RunConfig as Config
     from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 
@@ -19,6 +19,7 @@ __all__ = [
     "RunStopped",
     "UserError",
     "__version__",
+    "demo_scene",
     "edit",
     "evaluate",
     "load_scene",
@@ -30,6 +31,7 @@ _PLACES = {
     "Run": ("fd_mitsuba.runs.run", "Run"),
     "RunStopped": ("fd_mitsuba.errors", "RunStopped"),
     "UserError": ("fd_mitsuba.errors", "UserError"),
+    "demo_scene": ("fd_mitsuba.api", "demo_scene"),
     "edit": ("fd_mitsuba.api", "edit"),
     "evaluate": ("fd_mitsuba.api", "evaluate"),
     "load_scene": ("fd_mitsuba.api", "load_scene"),

@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 STAGES = ("geometry", "appearance")
 
 
+def demo_scene() -> Path:
+    """Path of the scene that ships with the package: a cat, and a focal region for a crown above its head.
+
+    Example:
+        scene = fd.load_scene(fd.demo_scene(), prompt="a cat with a pointed hat")
+    """
+    return Path(__file__).with_name("demo") / "cat" / "scene.xml"
+
+
 def load_scene(
     path: Path | str,
     parameters: Mapping[str, str] | None = None,
@@ -56,7 +65,7 @@ def load_scene(
 
     words = None if prompt is None else " ".join(prompt.split())
     if words == "":
-        raise UserError("prompt: is blank; say what the edited object looks like")
+        raise UserError("prompt: is blank; describe the edited object")
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
     share_cores(threads, variant)
@@ -77,7 +86,7 @@ def edit(
     stages: Collection[str] = STAGES,
     geometry_from: Path | str | None = None,
     tries: int | None = None,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
     command: str = "",
 ) -> Run:
     """Grow the part that a scene asks for, give it its material, write the run folder with all exports and its report.
@@ -90,18 +99,18 @@ def edit(
             name. With `guide_appearance` it serves the appearance stage as well.
         on_step: called with a `StepUpdate` after each finished step.
         resume: go on with the run in `output`.
-        quiet: no progress display, no remarks.
+        quiet: no progress display, no log lines.
         stages: which of `geometry` and `appearance` to run.
         geometry_from: another run of this scene, whose finished geometry is taken over.
         tries: grow up to so many seeds and keep the one that looks most like the prompt; see `evaluation.tries`.
-        say: takes remarks, a line each; None: they go to stderr unless `quiet`.
+        log: takes log lines and warnings; None: they go to stderr unless `quiet`.
         command: for the record in the run folder.
 
     Raises:
         UserError: bad input; `RunStopped` if a run cannot go on, `Interrupted` after SIGINT or SIGTERM.
     """
-    if say is None:
-        say = _nothing if quiet else _to_stderr
+    if log is None:
+        log = _nothing if quiet else _to_stderr
     if isinstance(scene, (str, Path)):
         scene = load_scene(scene)
     opening = []
@@ -124,19 +133,19 @@ def edit(
     taken = None if geometry_from is None else Path(geometry_from)
     if tries is not None and (taken, guidance, on_step) != (None, None, None):
         raise UserError("tries: grows shapes of its own; leave out the other run, and guidance and on_step")
-    with reported(folder, say):
+    with reported(folder, log):
         if tries is not None:
-            run_tries(scene, config, folder, tries, resume, command, quiet, say, tuple(stages), opening)
+            run_tries(scene, config, folder, tries, resume, command, quiet, log, tuple(stages), opening)
         else:
             run(
-                scene, config, folder, resume, command, quiet, say, tuple(stages), taken, guidance, on_step, opening,
+                scene, config, folder, resume, command, quiet, log, tuple(stages), taken, guidance, on_step, opening,
                 judge=judge_run,
             )  # fmt: skip
     result = Run(folder)
     said = result.metrics.get("verdict", {}).get("line")
     for warning in result.warnings:
         if warning != said:
-            say(f"warning: {warning}")
+            log(f"warning: {warning}")
     return result
 
 

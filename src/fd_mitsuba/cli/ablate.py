@@ -16,7 +16,9 @@ def add_ablate_commands(commands: argparse._SubParsersAction) -> None:
     """Put `ablate` beside the other commands."""
     ablate = commands.add_parser("ablate", help="one scene without single pieces of the method, as a table")
     ablate.add_argument("scene", help="Mitsuba scene file (XML)")
-    ablate.add_argument("-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE")
+    ablate.add_argument(
+        "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
+    )
     ablate.add_argument("--only", nargs="+", metavar="ROW", help="these rows and the full method; default: all")
     ablate.add_argument(
         "--stage", choices=("all", "geometry"), default="all", help="geometry: no appearance in any row; default: all"

@@ -11,7 +11,7 @@ from fd_mitsuba.cli.options import say
 def add_doctor_command(commands: argparse._SubParsersAction) -> None:
     """Put `doctor` beside the other commands."""
     doctor = commands.add_parser("doctor", help="what this machine offers: LLVM, Mitsuba, torch, the built-in prior")
-    doctor.add_argument("--json", action="store_true")
+    doctor.add_argument("--json", action="store_true", help="machine-readable")
     doctor.set_defaults(call=_doctor)
 
 

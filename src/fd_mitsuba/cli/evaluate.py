@@ -1,4 +1,4 @@
-"""The command `evaluate`: figures of finished runs, and of the shipped scenes from nothing."""
+"""The command `evaluate`: metrics of finished runs, and of the shipped scenes from nothing."""
 
 from __future__ import annotations
 
@@ -26,9 +26,11 @@ def judge_options(parser: argparse.ArgumentParser) -> None:
 
 
 def batch_options(parser: argparse.ArgumentParser, folder: str, default: str | None, seeds: list[int]) -> None:
-    """What to run first; `folder` is what the help says of the default."""
+    """What to run first; `folder` is the default as the help names it."""
     parser.add_argument("-c", "--config", default="quick", metavar="FILE|NAME", help="default: %(default)s")
-    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=seeds, metavar="N", help="default: %(default)s")
     parser.add_argument("-o", "--output", default=default, metavar="FOLDER", help=f"of these runs; default: {folder}")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="runs at a time; default: 1")
@@ -36,9 +38,9 @@ def batch_options(parser: argparse.ArgumentParser, folder: str, default: str | N
 
 def add_evaluate_commands(commands: argparse._SubParsersAction) -> None:
     """Put `evaluate` beside the other commands."""
-    evaluate = commands.add_parser("evaluate", help="figures of finished runs: CLIP scores, base, part, cost")
+    evaluate = commands.add_parser("evaluate", help="metrics of finished runs: CLIP scores, base, part, cost")
     evaluate.add_argument(
-        "runs", nargs="*", metavar="RUN", help="run folders; a scene file is run first, as the options below say"
+        "runs", nargs="*", metavar="RUN", help="run folders; a scene file is run first, by the options below"
     )
     evaluate.add_argument(
         "--all", action="store_true", help="every shipped scene that the guidance model can read, run if need be"
@@ -61,7 +63,7 @@ def add_evaluate_commands(commands: argparse._SubParsersAction) -> None:
         "--scenes", default="scenes", metavar="FOLDER", help="whose prompts are the rivals; default: %(default)s"
     )
     evaluate.add_argument("--again", action="store_true", help="also what is evaluated already")
-    evaluate.add_argument("--json", metavar="FILE", help="write all figures of all runs")
+    evaluate.add_argument("--json", metavar="FILE", help="write all metrics of all runs")
     evaluate.add_argument("--markdown", metavar="FILE", help="write the table")
     machine_options(evaluate)
     evaluate.set_defaults(call=_evaluate)
@@ -136,7 +138,7 @@ def _document(results: list[dict]) -> str:
 
 
 def _as_given(options: argparse.Namespace) -> list[str]:
-    """The options that say how runs are evaluated, for another process."""
+    """The options that decide how runs are evaluated, for another process."""
     words = ["--again"] if options.again else []
     for name in ("judge", "views", "size", "spp", "pictures", "scenes", "variant"):
         value = getattr(options, name)
@@ -145,7 +147,7 @@ def _as_given(options: argparse.Namespace) -> list[str]:
 
 
 def _readable_scenes(options: argparse.Namespace, shipped: list[ScenePrompts]) -> list[Path]:
-    """The shipped scenes that the settings' guidance model can read; a remark says why the others are left out."""
+    """The shipped scenes that the settings' guidance model can read; a line tells why the others are left out."""
     from fd_mitsuba.config import RunConfig
     from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
     from fd_mitsuba.guidance.prompt_reader import read_prompt

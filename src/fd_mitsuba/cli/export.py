@@ -33,8 +33,8 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
     render.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene anew"
     )
-    render.add_argument("-o", "--output", metavar="NAME", help="name of the pictures in RUN/renders; default: render")
-    render.add_argument("--views", type=int, default=8, metavar="N", help="pictures around the object; default: 8")
+    render.add_argument("-o", "--output", metavar="NAME", help="name of the images in RUN/renders; default: render")
+    render.add_argument("--views", type=int, default=8, metavar="N", help="images around the object; default: 8")
     render.add_argument("--size", type=int, default=256, metavar="N", help="pixels a side; default: 256")
     render.add_argument("--spp", type=int, default=128, metavar="N", help="samples a pixel; default: 128")
     render.add_argument("--depth", type=int, default=3, metavar="N", help="Mitsuba's max_depth; default: 3")

@@ -19,6 +19,8 @@ from fd_mitsuba import __version__
 from fd_mitsuba.cli.ablate import add_ablate_commands
 from fd_mitsuba.cli.batch import add_batch_commands
 from fd_mitsuba.cli.check import add_check_command
+from fd_mitsuba.cli.completion import add_completion_option
+from fd_mitsuba.cli.demo import add_demo_command
 from fd_mitsuba.cli.doctor import add_doctor_command
 from fd_mitsuba.cli.evaluate import add_evaluate_commands
 from fd_mitsuba.cli.export import add_export_commands
@@ -34,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code; user errors become one line on stderr."""
     own_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(arguments)
+    options = command_parser().parse_args(arguments)
     if own_process:
         _exit_on_signals(options)
         for stream in (sys.stdout, sys.stderr):
@@ -82,17 +84,20 @@ def _interrupted(options: argparse.Namespace) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage text before it."""
+    """Prints what is wrong in one line, without the usage text before it."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
-def _parser() -> argparse.ArgumentParser:
+def command_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line, which the command reference is made from, too."""
     parser = _Parser(prog="fd_mitsuba", description="Text-driven, part-wise 3D editing on Mitsuba 3.")
     parser.add_argument("--version", action="version", version=__version__)
+    add_completion_option(parser)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
+        add_demo_command,
         add_run_command,
         add_check_command,
         add_preview_command,

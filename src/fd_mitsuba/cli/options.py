@@ -1,4 +1,4 @@
-"""What several commands have in common: options of the machine, `-D`, remarks, the start of Mitsuba."""
+"""What several commands have in common: options of the machine, `-D`, lines on stderr, the start of Mitsuba."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def say(text: object) -> None:
 
 
 def remark(line: str) -> None:
-    """Say something on stderr."""
+    """Print a line on stderr."""
     print(f"fd_mitsuba: {printable(line)}", file=sys.stderr)
 
 
@@ -52,7 +52,7 @@ def definitions(options: argparse.Namespace) -> dict[str, str]:
 
 
 def start(options: argparse.Namespace) -> None:
-    """Start Mitsuba as the options say."""
+    """Start Mitsuba by the options."""
     quiet_libraries(options)
     from fd_mitsuba.backend.threads import share_cores
 

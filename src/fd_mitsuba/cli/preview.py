@@ -12,7 +12,7 @@ from fd_mitsuba.errors import UserError
 
 def add_preview_command(commands: argparse._SubParsersAction) -> None:
     """Put `preview` beside the other commands."""
-    preview = commands.add_parser("preview", help="pictures of the base with the focal regions drawn in")
+    preview = commands.add_parser("preview", help="images of the base with the focal regions drawn in")
     scene_options(preview)
     preview.add_argument("-o", "--output", metavar="FOLDER", help="default: runs/<scene>_preview")
     preview.set_defaults(call=_preview)

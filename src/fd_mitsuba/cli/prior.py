@@ -13,10 +13,10 @@ from fd_mitsuba.errors import UserError
 def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     """Put `prior` and its actions beside the other commands."""
     prior = commands.add_parser("prior", help="the words that the built-in prior knows; train and pack a new one")
-    prior.add_argument("--json", action="store_true")
+    prior.add_argument("--json", action="store_true", help="machine-readable")
     prior.set_defaults(call=_prior)
     actions = prior.add_subparsers(dest="action", metavar="ACTION")
-    train = actions.add_parser("train", help="train on fresh pictures; goes on where the folder's checkpoint ends")
+    train = actions.add_parser("train", help="train on fresh images; goes on where the folder's checkpoint ends")
     train.add_argument(
         "--kind",
         default="geometry",
@@ -29,24 +29,24 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     train.add_argument("--init", metavar="FOLDER", help="start from a packed prior instead of random weights")
     train.add_argument("--data", metavar="FOLDER", help="train on stored pairs of build-data instead of fresh ones")
     train.add_argument("--bf16", action="store_true", help="bfloat16: faster on a processor that has it (AVX512-BF16)")
-    train.add_argument("--batch", type=int, default=8, metavar="N", help="pictures a step; default: 8")
+    train.add_argument("--batch", type=int, default=8, metavar="N", help="images a step; default: 8")
     train.add_argument("--device", default="cpu", help="cpu or cuda; with cuda, render by --workers or from --data")
     train.add_argument(
         "--workers", type=int, default=0, metavar="N", help="processes that render; default: the training itself"
     )
-    train.add_argument("--seed", type=int, default=0)
-    train.add_argument("-t", "--threads", type=int, default=0, metavar="N")
+    train.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
+    train.add_argument("-t", "--threads", type=int, default=0, metavar="N", help="threads; default: all cores")
     train.set_defaults(call=_prior_train)
     pack = actions.add_parser("pack", help="write a checkpoint as a pipeline folder")
     pack.add_argument("checkpoint", help="checkpoint.pt of a training")
-    pack.add_argument("-o", "--output", required=True, metavar="FOLDER")
+    pack.add_argument("-o", "--output", required=True, metavar="FOLDER", help="the pipeline folder")
     pack.set_defaults(call=_prior_pack)
     build = actions.add_parser("build-data", help="write training pairs as files; goes on where a killed call ended")
-    build.add_argument("-o", "--output", default="runs/prior_data", metavar="FOLDER")
+    build.add_argument("-o", "--output", default="runs/prior_data", metavar="FOLDER", help="default: %(default)s")
     build.add_argument("--kind", default="geometry", help="geometry, geometry_fine or appearance (colours)")
     build.add_argument("--count", type=int, default=2048, help="pairs of four views each; default: 2048")
-    build.add_argument("--seed", type=int, default=0)
-    build.add_argument("-t", "--threads", type=int, default=0, metavar="N")
+    build.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
+    build.add_argument("-t", "--threads", type=int, default=0, metavar="N", help="threads; default: all cores")
     build.set_defaults(call=_prior_build_data)
     _add_evaluate(actions)
 
@@ -54,7 +54,7 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
 def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     evaluate = actions.add_parser(
         "evaluate",
-        help="sample a prior on unseen bodies and judge what it draws: a contact sheet beside the truth, and figures",
+        help="sample a prior on unseen bodies and judge what it draws: a contact sheet beside the truth, and metrics",
         description="Sample a prior on unseen bodies and judge what it draws. A shape sample of 16 steps takes about "
         "1.8 s of a core: the default (4 bodies, all parts, overviews and close-ups) 4 minutes, --bodies all about 20. "
         "A colour sample takes 1 s, a painted prompt (--paint) about 5 s.",
@@ -63,7 +63,7 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     evaluate.add_argument(
         "--kind", default="geometry", help="geometry (default), geometry_fine, appearance or evaluator"
     )
-    evaluate.add_argument("-o", "--output", metavar="FILE", help="PNG; the figures go into a .json beside it")
+    evaluate.add_argument("-o", "--output", metavar="FILE", help="PNG; the metrics go into a .json beside it")
     evaluate.add_argument(
         "--bodies", default="horse,cat,snowman,mug", metavar="A,B", help="or all; default: %(default)s"
     )
@@ -78,8 +78,8 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     evaluate.add_argument(
         "--paint", type=int, default=0, metavar="N", help="paint so many of them through the guidance"
     )
-    evaluate.add_argument("--seed", type=int, default=0)
-    evaluate.add_argument("-t", "--threads", type=int, default=0, metavar="N")
+    evaluate.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
+    evaluate.add_argument("-t", "--threads", type=int, default=0, metavar="N", help="threads; default: all cores")
     evaluate.set_defaults(call=_prior_evaluate)
 
 
@@ -147,7 +147,7 @@ def _evaluator_train(options: argparse.Namespace) -> int:
     with network_threads():
         steps = STEPS if options.steps is None else options.steps
         train_evaluator(Path(options.output), options.hours * 3600, total_steps=steps, seed=options.seed, data=data)
-    print(f"{options.output}: checkpoint.pt and log.jsonl; {data}: its pictures")
+    print(f"{options.output}: checkpoint.pt and log.jsonl; {data}: its images")
     return 0
 
 
@@ -244,7 +244,7 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
     )
     for part, row in {**report["per_part"], "kept out of training": report["held_out"]}.items():
         print(
-            f"{part}: {row['samples']} samples, found in {_share(row['recall'])} (in the true pictures in "
+            f"{part}: {row['samples']} samples, found in {_share(row['recall'])} (in the true images in "
             f"{_share(row['recall_in_truth'])}), body named in {_share(row['body_named'])}, kept pixel by pixel in "
             f"{_share(row['body_kept'])}, its shape in {_share(row['shape_kept'])}"
         )

@@ -13,23 +13,30 @@ def add_run_command(commands: argparse._SubParsersAction) -> None:
     """Put `run` beside the other commands."""
     run = commands.add_parser("run", help="grow the part that the scene asks for")
     scene_options(run)
-    settings_options(run)
-    run.add_argument("-o", "--output", metavar="FOLDER", help="run folder; default: runs/<scene>")
-    run.add_argument(
+    run_options(run, "runs/<scene>")
+    run.set_defaults(call=run_scene)
+
+
+def run_options(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Settings, output and stages of a run; `folder` is the default output as the help names it."""
+    settings_options(parser)
+    parser.add_argument("-o", "--output", metavar="FOLDER", help=f"run folder; default: {folder}")
+    parser.add_argument(
         "--stage", choices=("all", "geometry", "appearance"), default="all", help="default: all, one after the other"
     )
-    run.add_argument(
+    parser.add_argument(
         "--from", dest="geometry_from", metavar="RUN", help="take the finished geometry of another run of this scene"
     )
-    run.add_argument(
+    parser.add_argument(
         "--tries", type=int, metavar="N", help="grow up to N seeds, keep the one that looks most like the prompt"
     )
-    run.add_argument("--resume", action="store_true", help="go on with an interrupted run in the output folder")
-    run.add_argument("-q", "--quiet", action="store_true", help="no progress display")
-    run.set_defaults(call=_run, resumable=True)
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted run in the output folder")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress display")
+    parser.set_defaults(resumable=True)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run_scene(options: argparse.Namespace) -> int:
+    """Edit `options.scene`, print where the result is and how good it is."""
     settings = chosen_settings(options)
     scene = load(options)
     from fd_mitsuba.api import STAGES, edit
@@ -43,12 +50,12 @@ def _run(options: argparse.Namespace) -> int:
         stages=STAGES if options.stage == "all" else (options.stage,),
         geometry_from=options.geometry_from,
         tries=options.tries,
-        say=remark,
+        log=remark,
         command=options.command_line,
     )
     metrics = run.metrics
     picture = "appearance" if "appearance" in metrics else "turntable"
-    say(f"{run.folder}: part in export/, pictures in images/{picture}.png, all in report.html")
+    say(f"{run.folder}: part in export/, images in images/{picture}.png, all in report.html")
     say(
         f"inside the region {metrics['inside_fraction']:.1%}, overlap with the base {metrics['overlap_fraction']:.1%}, "
         f"base identical: {metrics['base_identical']}, {metrics['seconds']:.0f} s"

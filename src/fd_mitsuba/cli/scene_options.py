@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 def scene_options(parser: argparse.ArgumentParser) -> None:
     """The scene, -D, --prompt, --regions, and the machine's options."""
     parser.add_argument("scene", help="Mitsuba scene file (XML)")
+    scene_changes(parser)
+
+
+def scene_changes(parser: argparse.ArgumentParser) -> None:
+    """All of `scene_options` but the scene itself."""
     parser.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
     )
@@ -48,7 +53,7 @@ def chosen_settings(options: argparse.Namespace) -> ChosenSettings:
 
 
 def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:
-    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `api.load_scene`."""
+    """The scene, with Mitsuba started by the options; `on_misplaced` as in `api.load_scene`."""
     parameters = definitions(options)
     quiet_libraries(options)
     from fd_mitsuba.api import load_scene

@@ -30,7 +30,7 @@ def is_small_prior(model: str) -> bool:
 
 
 def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -> ChosenSettings:
-    """The settings that the user chose; without a choice those that suit the guidance model, which is said in a line.
+    """The settings that the user chose; without a choice those that suit the guidance model, which a line names.
 
     Args:
         choice: as `source` of `RunConfig.load`; None: `quick` for the built-in prior and its like, `paper` otherwise.

@@ -33,6 +33,7 @@ class RunConfig(Section):
     """Everything that decides a run besides the scene."""
 
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+    """All random numbers of a run follow from it."""
     field: FieldConfig = FieldConfig()
     geometry: GeometryConfig = GeometryConfig()
     texture: TextureConfig = TextureConfig()

@@ -58,40 +58,62 @@ class FieldConfig(Section):
     """The editable part's network: a hash grid and a two-layer MLP (paper, supplement "Geometry Learning")."""
 
     levels: Levels = 10
+    """Number of resolutions of the hash grid."""
     features: Features = 2
+    """Learned numbers of an entry of the grid."""
     base_resolution: Cells = 8
+    """Cells a side of the coarsest level."""
     finest_resolution: Cells = 128
+    """Cells a side of the finest level; the levels between grow by a constant factor."""
     log2_table: Annotated[int, Field(ge=4, le=24)] = 15
+    """A level of the grid holds at most 2^log2_table entries."""
     hidden: Neurons = 32
+    """Width of the network's hidden layer."""
     offsets: bool = True
     """Let vertices of the tetrahedral grid move by up to half a cell, where the base's surface is not touched."""
 
 
 class GeometryConfig(Section):
+    """The geometry stage: its steps, the union with the base, and the losses on the part's signed distance."""
+
     steps: Steps = 3000
+    """Steps of the geometry stage."""
     coarse_fraction: Fraction = 2 / 3
     """Share of the steps in the coarse phase; the rest is the refined phase."""
     learning_rate: Rate = 1e-3
+    """Step size of AdamW."""
     betas: Range = (0.9, 0.99)
+    """Decay rates of AdamW's running averages."""
     eps: Rate = 1e-15
+    """Smallest divisor in a step of AdamW."""
     weight_decay: Fraction = 0.01
+    """Weight decay of AdamW."""
     grid_resolution: Annotated[int, Field(ge=8, le=256)] = 64
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
     union_k: Length = 0.15
+    """Width of the fillet between base and part in canonical units; the paper's k."""
     union_only_outside: bool = False
+    """Blend only outside of both, so that neither swells inside the other."""
     start_variety: Fraction = 0.0
     """How much seeds other than 0 vary what the part starts as, within its regions; not in the paper."""
     lambda_sds: Weight = 1.0
+    """Weight of the guidance's loss."""
     lambda_focal: Weight = 1000.0
+    """Weight of `loss_focal`, which keeps the part in its focal regions; the paper's L_GF."""
     focal_sigma_distance: Width = 0.05
+    """Softness of the region's border in `loss_focal`, canonical units squared; the paper's sigma_1."""
     focal_sigma_sdf: Width = 0.01
+    """Softness of the part's border in `loss_focal`, canonical units; the paper's sigma_2."""
     focal_margin: Length = 0.0
     """The paper's xi: also punishes an SDF that is negative by less than this."""
     focal_band: Length = 0.05
     """Distance around the focal region, in canonical units, in which the part may overrun for free."""
     focal_samples: Points = 10240
+    """Vertices of the grid near the regions at which the losses on the field are taken, a step."""
     lambda_collision: Weight = 100.0
+    """Weight of `loss_collision`, which keeps the part out of the base; the paper's L_CA."""
     lambda_volume: Weight = 0.0
+    """Weight of a penalty on the share of the space that the part fills; not in the paper."""
     lambda_presence: Weight = 0.0
     """Weight of the loss that leaves no focal region without a part; not in the paper."""
     presence_share: Annotated[float, Field(gt=0, le=1)] = 0.02
@@ -99,24 +121,36 @@ class GeometryConfig(Section):
     lambda_tether: Weight = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
     views: Views = 4
+    """Cameras a step."""
     spp: Samples = 4
+    """Samples a pixel."""
     silhouette_spp: Samples = 1
+    """Points on outlines, for each pixel of an image; they carry the gradient of the silhouettes."""
     normal_space: Literal["camera", "world"] = "camera"
+    """Frame of the normals that are rendered."""
 
 
 class TextureConfig(Section):
     """The part's texture field: a hash grid and an MLP with one hidden layer (supplement "PBR Material")."""
 
     levels: Levels = 12
+    """Number of resolutions of the hash grid."""
     features: Features = 2
+    """Learned numbers of an entry of the grid."""
     base_resolution: Cells = 16
+    """Cells a side of the coarsest level."""
     finest_resolution: Cells = 1024
+    """Cells a side of the finest level."""
     log2_table: Annotated[int, Field(ge=4, le=24)] = 16
+    """A level of the grid holds at most 2^log2_table entries."""
     hidden: Neurons = 32
+    """Width of the network's hidden layer."""
     base_color_range: Range = (0.03, 0.94)
     """Above 0.94 a `principled` returns more light than it gets, since its highlight comes on top of the rest."""
     roughness_range: Range = (0.08, 1.0)
+    """Least and greatest roughness that can be learned."""
     metallic_range: Range = (0.0, 1.0)
+    """Least and greatest metallic that can be learned."""
     max_tilt_deg: Annotated[float, Field(ge=0, lt=90)] = 30.0
     """How far the field may bend a shading normal."""
 
@@ -132,35 +166,54 @@ class TextureConfig(Section):
 
 
 class AppearanceConfig(Section):
+    """The appearance stage: what is rendered, what may be learned, and the losses on the material."""
+
     steps: Steps = 2000
+    """Steps of the appearance stage."""
     learning_rate: Rate = 1e-2
+    """Step size of AdamW."""
     betas: Range = (0.9, 0.99)
+    """Decay rates of AdamW's running averages."""
     eps: Rate = 1e-15
+    """Smallest divisor in a step of AdamW."""
     weight_decay: Fraction = 0.01
+    """Weight decay of AdamW."""
     views: Views = 4
+    """Cameras a step."""
     picture_size: Annotated[int, Field(ge=16, le=4096)] | None = None
     """Side of a rendered view in pixels; none: what the guidance model works with."""
     spp: Samples = 16
+    """Samples a pixel."""
     max_depth: Annotated[int, Field(ge=-1, le=1000)] = 2
     """As Mitsuba's `path`: 2 is direct light with shadows, more adds bounces, -1 does not end them."""
     exposure: Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)] | None = None
     """Factor on linear colour before the sRGB curve; none: chosen once from the base as it is lit."""
     background: Literal["black", "white", "random", "light"] = "white"
+    """What is behind the object; `light` is the environment."""
     normal_map: bool = True
+    """Whether the field may bend shading normals."""
     fixed: tuple[TextureChannel, ...] = ()
     """Channels that keep the values of the scene's part BSDF."""
     timestep_range: Range = (0.02, 0.98)
+    """Noise levels that are drawn, as shares of all timesteps."""
     weighting: Weighting = "inverse"
+    """Weight of a timestep; `guidance.sds` has the formulas."""
     guidance_scale: GuidanceScale = 100.0
+    """As `guidance.guidance_scale`, for this stage."""
     image_guidance_scale: GuidanceScale = 1.0
+    """As `guidance.image_guidance_scale`, for this stage."""
     mask_guidance: bool = True
     """Noise and gradient only where the part is seen."""
     lambda_sds: Weight = 1.0
+    """Weight of the guidance's loss."""
     style: bool = False
     """Style consistency with the base, for parts that continue its material; most edits do without."""
     lambda_style: Weight = 10.0
+    """Weight of `loss_style_gradient`: the material varies slowly. Counts with `style`."""
     lambda_boundary: Weight = 100.0
+    """Weight of `loss_style_boundary`: where the part meets the base it has its material. Counts with `style`."""
     style_samples: Points = 2048
+    """Points of the part's surface for these two losses, a step."""
     style_jitter: Width = 0.01
     """Standard deviation of the paper's delta, canonical units."""
     boundary_reach: Width = 0.03
@@ -188,6 +241,8 @@ class AppearanceConfig(Section):
 
 
 class GuidanceConfig(Section):
+    """The model that guides both stages, and how its gradient is made."""
+
     model: Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
     variant: Literal["sds", "csd", "ism", "reconstruction"] = "sds"
@@ -201,25 +256,38 @@ class GuidanceConfig(Section):
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0
+    """Weight of the base's image, for models with 8 input channels."""
     weighting: Weighting = "sds"
+    """Weight of a timestep; `guidance.sds` has the formulas."""
     timestep_range_coarse: Range = (0.02, 0.35)
+    """Noise levels that are drawn in the coarse phase, as shares of all timesteps."""
     timestep_range_refined: Range = (0.02, 0.35)
+    """The same in the refined phase."""
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
     """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
     normalise_gradient: bool = False
+    """Bring the guidance's gradient to a fixed size, so that the other weights are relative to it."""
     views_per_call: Annotated[Views, MAY_CHANGE] = 4
     """Pictures sent through the UNet at once; fewer need less memory."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Precision of the UNet; the VAE stays in float32."""
     device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d{1,3})?)$"), MAY_CHANGE] = "cpu"
     """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
+    """Add words for the view's direction to the prompt."""
 
 
 class CamerasConfig(Section):
+    """From where the training images are seen; azimuths are spread around the object."""
+
     radius: Annotated[float, Field(ge=0.5, le=100, allow_inf_nan=False)] = 3.0
+    """Distance of the cameras, canonical units."""
     elevation_deg: Range = (-10.0, 45.0)
+    """Lowest and highest elevation."""
     fov_deg: Range = (38.0, 45.0)
+    """Least and greatest field of view."""
     centre_jitter: Length = 0.0
+    """Half side of the cube in which the point lies that is looked at, canonical units."""
     aim: Literal["origin", "object"] = "origin"
     """What the cameras look at: the base's centre, or the centre of base and focal regions together."""
     focus_fraction: Fraction = 0.0
@@ -230,10 +298,15 @@ class OutputConfig(Section):
     """What is written, how often and how large; nothing of it changes the part."""
 
     sheet_every: Annotated[int, Field(ge=0, le=1_000_000), MAY_CHANGE] = 250
+    """Steps between contact sheets; 0: none."""
     checkpoint_every: Annotated[Steps, MAY_CHANGE] = 100
+    """Steps between checkpoints."""
     checkpoints_kept: Annotated[Steps, MAY_CHANGE] = 2
+    """How many of the newest checkpoints stay."""
     turntable_frames: Annotated[int, Field(ge=1, le=1000), MAY_CHANGE] = 48
+    """Frames of a turntable."""
     turntable_size: Annotated[int, Field(ge=16, le=4096), MAY_CHANGE] = 256
+    """Pixels a side of a turntable."""
     texture_size: Annotated[int, Field(ge=16, le=8192), MAY_CHANGE] = 1024
     """Texels a side of each exported part's pictures."""
 

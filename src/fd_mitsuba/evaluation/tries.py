@@ -79,9 +79,7 @@ def run_tries(
     _set_aside(folder, best.seed, say)
     chosen, source = config.model_copy(update={"seed": best.seed}), folder / best.folder
     again = (folder / "run.json").is_file()
-    metrics = run(
-        scene, chosen, folder, again, command, quiet, say, stages, source, opening=opening, judge=judge_run
-    )
+    metrics = run(scene, chosen, folder, again, command, quiet, say, stages, source, opening=opening, judge=judge_run)
     _take_record(source, folder)
     _write(folder, done, best.seed)
     metrics["tries"] = {f"seed {one.seed}": one.line for one in done}

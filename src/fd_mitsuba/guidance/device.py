@@ -29,7 +29,5 @@ def require_device(name: str, setting: str = "guidance.device") -> torch.device:
                 "install a driver and a CUDA build of torch"
             )
     if device.type == "mps" and not torch.backends.mps.is_available():
-        raise UserError(
-            f"{setting} = {name!r}: torch {torch.__version__} finds no Apple GPU; set {setting} to cpu"
-        )
+        raise UserError(f"{setting} = {name!r}: torch {torch.__version__} finds no Apple GPU; set {setting} to cpu")
     return device

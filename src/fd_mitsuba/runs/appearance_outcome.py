@@ -1,4 +1,4 @@
-"""The appearance stage of a run folder: from its parts' meshes to learned materials, pictures and figures."""
+"""The appearance stage of a run folder: from its parts' meshes to learned materials, images and metrics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from fd_mitsuba.viewing.turntable import write_sheet, write_video
 _SHEET_VIEWS = 8
 _VIDEO_SPP, _SHEET_SPP = 12, 32
 _BRIGHTEST_BOUNCE = 1.0
-"""What a sample may see by way of another surface in the pictures of `render_run`, in units of the picture's white."""
+"""What a sample may see by way of another surface in the images of `render_run`, in units of the image's white."""
 CUTS_UNKNOWN = (
     "its regions subtract, and the built-in prior knows no faces of a cut; set appearance.lambda_sds=0 and "
     "appearance.style=true for faces that go on with the base's material, or guidance.model to a Stable Diffusion model"
@@ -80,7 +80,7 @@ def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None
         for number, name in names.items()
     )
     if not plain:
-        raise UserError(f"{record}: does not say what is left of the base; run the geometry stage anew")
+        raise UserError(f"{record}: does not state what is left of the base; run the geometry stage anew")
     opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
     for path in opened.values():
         if path is not None and not path.is_file():
@@ -105,7 +105,7 @@ def prepare_appearance(
     """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
 
     Args:
-        say: takes remarks about the scene, `say_of_prompt` those about the prompt's words.
+        say: takes log lines about the scene, `say_of_prompt` those about the prompt's words.
         shared: the geometry stage's guidance, so that a large model is loaded once.
         given: a caller's own guidance, in place of the one that `guidance.model` names.
 
@@ -139,7 +139,7 @@ def finished_appearance(
     """The appearance stage of a run at its newest checkpoint, without guidance; None if it has not begun.
 
     Args:
-        max_depth: for pictures with more bounces of light than the stage was trained with.
+        max_depth: for images with more bounces of light than the stage was trained with.
 
     Raises:
         UserError: parts are missing, or every checkpoint is damaged.
@@ -156,7 +156,7 @@ def finished_appearance(
 
 
 def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
-    """Write the lit turntable, before and after, and the maps; returns the measured figures."""
+    """Write the lit turntable, before and after, and the maps; returns the measured metrics."""
     output, rendering = stage.config.output, stage.rendering
     alone = AppearancePass(stage.scene, {}, stage.shading, rendering.size, rendering.spp)
     video = lit_turntable(stage, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
@@ -215,7 +215,7 @@ def render_run(
     if views < 1 or size < 16 or spp < 1 or (max_depth < 2 and max_depth != -1):
         raise UserError(f"--views {views} --size {size} --spp {spp} --depth {max_depth}: too small; raise it")
     if Path(name).name != name:
-        raise UserError(f"--output {name}: give a name without folders; pictures go to {folder / 'renders'}")
+        raise UserError(f"--output {name}: give a name without folders; images go to {folder / 'renders'}")
     scene, config = saved_run(folder, changed, say)
     stage = finished_appearance(scene, config, folder, max_depth)
     if stage is None:

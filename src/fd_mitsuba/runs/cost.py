@@ -16,7 +16,7 @@ START_AND_EXPORT_SECONDS = 15.0
 """What every run takes besides its steps: imports, kernels, meshes, turntable."""
 
 LIT_PICTURES_SECONDS = 45.0
-"""What the appearance stage takes besides its steps: kernels, lit turntable, baked pictures."""
+"""What the appearance stage takes besides its steps: kernels, lit turntable, baked textures."""
 
 _OPERATIONS = 6e10
 """Floating-point operations a second of two cores on the networks of Stable Diffusion."""

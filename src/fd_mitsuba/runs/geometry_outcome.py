@@ -1,4 +1,4 @@
-"""The geometry stage within a run: its guidance, its outcome in another folder, the meshes and pictures it leaves."""
+"""The geometry stage within a run: its guidance, its outcome in another folder, the meshes and images it leaves."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def prepare_geometry(
 
 
 def with_prompt(given: Guidance | AppearanceGuidance, scene: EditScene, say: Callable[[str], None]) -> Any:
-    """A caller's own guidance with the scene's prompts; the words that it does not know are said."""
+    """A caller's own guidance with the scene's prompts; the words that it does not know are logged."""
     unknown = given.set_prompt(scene.prompt, scene.negative_prompt)
     if unknown:
         say(f"{type(given).__name__} does not know {', '.join(map(repr, unknown))}")
@@ -95,7 +95,7 @@ def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> Ge
 
 
 def export_geometry(stage: GeometryStage, folder: Path) -> dict:
-    """Write meshes, turntable and contact sheet of the stage's present state; returns the measured figures."""
+    """Write meshes, turntable and contact sheet of the stage's present state; returns the measured metrics."""
     scene, config, export = stage.scene, stage.config, folder / "export"
     with torch.no_grad():
         union = stage.surface()

@@ -86,7 +86,7 @@ def run(
         folder: made if it is missing; must be empty, or hold a run of the same scene and settings to go on with.
         resume: go on with the run in `folder`.
         command: the command line, for the record.
-        say: takes remarks for the user, a line each.
+        say: takes log lines and warnings for the user.
         stages: which of `STAGES` to run. The appearance stage alone needs a folder whose geometry stage is finished.
         geometry_from: another run folder, whose finished geometry is taken over instead of running that stage.
         guidance: a caller's own, in place of the model that the settings name. The appearance stage takes it too where

@@ -17,7 +17,7 @@ from fd_mitsuba.render.gbuffer import GBuffer, Samples
 from fd_mitsuba.scene.views import CameraBatch
 
 MOST_DECIBELS = 200.0
-"""What equal pictures are given, so that the figure stays a number in JSON."""
+"""What equal images are given, so that the metric stays a number in JSON."""
 
 _POINTS_AT_ONCE = 16384
 

@@ -1,4 +1,4 @@
-"""A run folder as an object: its part, its metrics, its exports and pictures."""
+"""A run folder as an object: its part, its metrics, its exports and images."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should look at, a line each, as said at the end of the run."""
+        """What the user should look at, a line each, as logged at the end of the run."""
         return list(self.metrics.get("warnings", []))
 
     @property
@@ -110,10 +110,10 @@ class Run:
         spp: int = 128,
         max_depth: int = 3,
     ) -> list[Path]:
-        """Render the object all around; returns the sheet's path and those of the single pictures.
+        """Render the object all around; returns the sheet's path and those of the single images.
 
         Args:
-            name: of the pictures in `folder/renders`.
+            name: of the images in `folder/renders`.
             values: other values for the scene's `$name`, such as `{"light": "../lighting/sunset.exr"}`.
 
         Raises:
@@ -125,15 +125,15 @@ class Run:
         return render_run(self.folder, dict(values or {}), name, views, size, spp, max_depth)
 
     def show(self) -> Any:
-        """In a notebook: the result's picture, from all sides. Elsewhere: its path.
+        """In a notebook: the result's image, from all sides. Elsewhere: its path.
 
         Raises:
-            UserError: no picture there yet.
+            UserError: no image there yet.
         """
         candidates = [self.folder / "images" / f"{name}.png" for name in ("appearance", "turntable")]
         path = next((path for path in candidates if path.is_file()), None)
         if path is None:
-            raise UserError(f"{self.folder}: no picture yet; the geometry stage is not finished")
+            raise UserError(f"{self.folder}: no image yet; the geometry stage is not finished")
         try:
             from IPython.core.getipython import get_ipython
             from IPython.display import Image

@@ -81,9 +81,7 @@ _OWN = (
 )
 
 
-def write_gallery(
-    folders: Sequence[Path], path: Path, title: str = "Runs", say: Callable[[str], None] = print
-) -> Path:
+def write_gallery(folders: Sequence[Path], path: Path, title: str = "Runs", say: Callable[[str], None] = print) -> Path:
     """Write the page; returns its path.
 
     Args:
