@@ -70,7 +70,7 @@ def test_the_settings_page_has_every_setting_with_its_range_and_values() -> None
     assert len(rows) == outside + sum(len(model.model_fields) for model in SECTIONS.values())
     cells = next(line for line in rows if line.startswith("| `grid_resolution`"))
     assert cells.split(" | ")[1:5] == ["integer ≥ 8, ≤ 256", "`64`", "", ""]
-    steps = next(line for line in rows if line.startswith("| `steps` | integer ≥ 1 | `3000`"))
+    steps = next(line for line in rows if line.startswith("| `steps` | integer ≥ 1, ≤ 1000000 | `3000`"))
     assert steps.split(" | ")[3] == "`400`"
 
 
