@@ -13,6 +13,7 @@ from conftest import write_ply
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.check import check_scene
+from fd_mitsuba.runs.pipeline import run
 from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
@@ -65,15 +66,18 @@ BALL = """<shape type="focal_region" id="{name}"><string name="part" value="{par
   <scale value="0.08"/><translate y="{y}"/></transform></shape>"""
 
 
-def test_a_region_within_the_base_is_refused(make_scene: Make) -> None:
+def test_a_region_within_the_base_is_refused(make_scene: Make, tmp_path: Path) -> None:
     within = BALL.format(name="heart", part="wing", y=0)
-    with pytest.raises(UserError, match='id="heart">: lies wholly within the base.*move it outwards'):
-        load_edit_scene(make_scene(region=within))
+    for refuse in (check_scene, lambda scene, config: run(scene, config, tmp_path / "run", quiet=True)):
+        with pytest.raises(UserError, match="region heart: lies wholly within the base.*move it outwards"):
+            refuse(load_edit_scene(make_scene(region=within)), RunConfig())
+    assert not (tmp_path / "run").exists()
     beside = BALL.format(name="fin", part="wing", y=0.27)
-    assert len(load_edit_scene(make_scene(region=within + beside)).regions) == 2  # the part is seen
+    found = check_scene(load_edit_scene(make_scene(region=within + beside)), RunConfig()).regions
+    assert found[0].share_in_base == 1 > found[1].share_in_base  # the part is seen
     other = BALL.format(name="fin", part="fin", y=0.27)
-    with pytest.raises(UserError, match='id="heart">: lies wholly within the base'):
-        load_edit_scene(make_scene(region=within + other))
+    with pytest.raises(UserError, match="region heart: lies wholly within the base"):
+        check_scene(load_edit_scene(make_scene(region=within + other)), RunConfig())
 
 
 def state(vertices: np.ndarray, faces: np.ndarray, make_scene: Make, folder: Path) -> str:

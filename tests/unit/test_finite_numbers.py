@@ -68,3 +68,8 @@ def test_numbers_that_only_a_file_holds(make_scene: Make, tmp_path: Path) -> Non
 
 def test_a_sound_scene_is_taken(make_scene: Make) -> None:
     assert np.isfinite(load_edit_scene(make_scene()).base_soup.vertices).all()
+
+
+def test_parameters_that_cannot_be_read_are_no_error(make_scene: Make) -> None:
+    """Those of Mitsuba's `hair`, which has absorption or pigments and offers both."""
+    load_edit_scene(make_scene(base=BODY.format('<bsdf type="hair"/>')))

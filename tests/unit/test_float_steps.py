@@ -8,28 +8,47 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from cases import CASES
+from PIL import Image
 from pygltflib import GLTF2
 from scipy.spatial import KDTree
 
 from fd_mitsuba.config import GeometryConfig, RunConfig
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.evaluation.part_check import check_parts
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.meshes import write_mesh
 from fd_mitsuba.export.solid.part_solid import part_solid
-from fd_mitsuba.io.float_steps import float_step, is_coarse
+from fd_mitsuba.io.float_steps import float_step, is_coarse, size_warnings
+from fd_mitsuba.io.ply import ply_bytes
+from fd_mitsuba.render.appearance_pass import AppearancePass
+from fd_mitsuba.render.part_shading import PartShading
 from fd_mitsuba.runs.check import check_scene
+from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.scene.views import ring_views
 from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.viewing.preview import preview_scene
 
 FAR = CASES / "far_from_origin" / "far1"
 AWAY = np.array([45200.0, 35.0, 54110.0])
 SCENE = """<scene version="3.0.0"><integrator type="dual_path"><string name="prompt" value="a ball with a hat"/>
-  <string name="base_prompt" value="a ball"/></integrator><emitter type="constant"/>
+  <string name="base_prompt" value="a ball"/></integrator>{light}
   <shape type="{kind}" id="base"><string name="filename" value="m.{kind}"/><bsdf type="diffuse"/></shape>
   <shape type="focal_region" id="hat"><transform name="to_world"><scale x="{x}" y="{y}" z="{x}"/>
     <translate x="{place[0]}" y="{place[1]}" z="{place[2]}"/></transform></shape></scene>"""
+
+
+SKY = '<emitter type="constant"/>'
+POINT = """<emitter type="point"><point name="position" x="{}" y="{}" z="{}"/><rgb name="intensity" value="20"/>
+  </emitter>"""
+SPOT = """<emitter type="spot"><rgb name="intensity" value="40"/><float name="cutoff_angle" value="80"/>
+  <transform name="to_world"><rotate y="1" angle="180"/><translate x="{}" y="{}" z="{}"/></transform></emitter>"""
+LAMP = """<shape type="sphere" id="lamp"><float name="radius" value="0.5"/><emitter type="area"/>
+  <transform name="to_world"><translate x="{}" y="{}" z="{}"/></transform></shape>"""
 
 
 def positions() -> tuple[np.ndarray, list[str]]:
@@ -40,9 +59,10 @@ def positions() -> tuple[np.ndarray, list[str]]:
     return np.array(rows), lines[start + 1225 :]
 
 
-def ball(folder: Path, scale: float = 1.0, kind: str = "ply", away: np.ndarray | None = None) -> Path:
+def ball(folder: Path, scale: float = 1.0, kind: str = "ply", away: np.ndarray | None = None, light: str = SKY) -> Path:
     """The same ball elsewhere, in another unit or format."""
     away = np.zeros(3) if away is None else away
+    light = light.format(*(away + np.array([1.5, 3, 4]) * scale))
     found, faces = positions()
     rows = [" ".join(f"{value:.17g}" for value in row) for row in (found - AWAY) * scale + away]
     if kind == "obj":
@@ -59,7 +79,7 @@ def ball(folder: Path, scale: float = 1.0, kind: str = "ply", away: np.ndarray |
     (folder / f"m.{kind}").write_text("\n".join(text) + "\n")
     path = folder / "scene.xml"
     place = np.array([0, 1.25, 0]) * scale + away
-    path.write_text(SCENE.format(kind=kind, x=0.55 * scale, y=0.5 * scale, place=place))
+    path.write_text(SCENE.format(light=light, kind=kind, x=0.55 * scale, y=0.5 * scale, place=place))
     return path
 
 
@@ -84,6 +104,16 @@ def test_a_part_far_away_is_as_clean_as_at_the_origin(tmp_path: Path) -> None:
     np.testing.assert_allclose(areas(far), areas(near), rtol=1e-3, atol=1e-9)
     assert areas(far).min() > 1e-8 and far.is_watertight
     np.testing.assert_allclose(far.vertices - AWAY, near.vertices, atol=1e-5)
+
+
+def test_the_volume_of_a_part_far_away_is_measured(tmp_path: Path) -> None:
+    """Of a ball, 50 km away."""
+    vertices, faces = unit_sphere(4)
+    (tmp_path / "export").mkdir()
+    for away in (np.zeros(3), AWAY):
+        (tmp_path / "export" / "part_hat.ply").write_bytes(ply_bytes(vertices + away, faces))
+        found = check_parts(["hat"], tmp_path, 0.5)["hat"]
+        assert found["valid"] and found["volume"] == pytest.approx(4 / 3 * np.pi / 8, rel=5e-3)
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj"])
@@ -143,6 +173,36 @@ def test_exports_far_away_are_the_near_ones_moved(tmp_path: Path, mi: Any) -> No
     assert mi.load_file(str(tmp_path / "far/out/mitsuba/scene.xml")).bbox().min[0] > 45000
 
 
+@pytest.mark.parametrize("light", [SKY, POINT, SPOT, LAMP])
+def test_renders_far_away_are_those_at_the_origin(tmp_path: Path, mi: Any, light: str) -> None:
+    """Base and part under every kind of light; without moving, the ball has steps and its shadows blotches."""
+    pictures = []
+    for name, away in (("near", np.zeros(3)), ("far", AWAY)):
+        (tmp_path / name).mkdir()
+        scene = load_edit_scene(ball(tmp_path / name, away=away, light=light))
+        hat = scene.regions[0].surface(3)
+        shading = PartShading({"type": "diffuse"})
+        rendering = AppearancePass(scene, {"part": hat}, shading, 48, 16)
+        cameras = ring_views(2, 20.0, fov_deg=45.0, radius=3.4)
+        gbuffer = rendering.trace(cameras, 0)
+        pictures.append(rendering.render_base(gbuffer, 0) + rendering.render_clay(gbuffer, 0))
+        material = BaseAppearance(scene).lookup(torch.from_numpy(np.array(hat.vertices[:5])).float())
+        assert material.base_color[:, 0] == pytest.approx([0.5] * 5, abs=1e-5)
+    assert pictures[0].mean() > 2e-4
+    difference = (pictures[0] - pictures[1]).abs()
+    assert float(difference.mean() / pictures[0].mean()) < 2e-3
+    assert float((difference > 0.05 * pictures[0].max()).float().mean()) < 2e-3
+
+
+def test_the_preview_far_away_is_that_at_the_origin(tmp_path: Path) -> None:
+    sheets = []
+    for name, away in (("near", np.zeros(3)), ("far", AWAY)):
+        (tmp_path / name).mkdir()
+        (sheet,) = preview_scene(load_edit_scene(ball(tmp_path / name, away=away)), tmp_path / name, views=2, size=96)
+        sheets.append(np.asarray(Image.open(sheet).convert("RGB")).astype(float))
+    assert np.abs(sheets[0] - sheets[1]).mean() < 0.5 and sheets[0].std() > 20
+
+
 @pytest.mark.parametrize(
     ("scale", "words"), [(1e-12, "too small for 32-bit floats"), (1e12, "too large for 32-bit floats")]
 )
@@ -165,9 +225,6 @@ def test_small_units_are_told(tmp_path: Path) -> None:
 
 def test_the_warning_about_small_units_is_measured(mi: Any) -> None:
     """A ball on another: below the size that is told, Mitsuba's picture of the same thing is another one."""
-    from fd_mitsuba.io.float_steps import size_warnings
-    from fd_mitsuba.scene.tessellate import unit_sphere
-
     vertices, faces = unit_sphere(3)
 
     def picture(scale: float) -> np.ndarray:

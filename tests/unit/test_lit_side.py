@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -183,6 +185,24 @@ def test_other_bsdfs_are_no_alarm(ball: Callable[..., Path], mi: Any, kind: str)
     assert not warned(ball(bsdf=f'<bsdf type="{kind}"/>'), mi)
     masked = f'<bsdf type="mask"><float name="opacity" value="0.3"/>{MATT}</bsdf>'
     assert not warned(ball(bsdf=masked), mi)
+
+
+def test_a_see_through_shape_is_no_alarm(ball: Callable[..., Path], mi: Any) -> None:
+    assert not warned(ball(bsdf='<bsdf type="null"/>'), mi)
+
+
+def test_what_mitsuba_loads_but_cannot_render_is_one_line(tmp_path: Path) -> None:
+    """In a process of its own: there, Mitsuba would trace that BSDF in every further render."""
+    bump = f'<bsdf type="bumpmap"><texture type="checkerboard"/>{MATT}</bsdf>'
+    for light in (SKY, ""):
+        (tmp_path / "m.ply").write_bytes((CASES / "ply_uv_upside_down" / "m.ply").read_bytes())
+        path = tmp_path / "scene.xml"
+        path.write_text(SCENE.format(light=light, extra="", bsdf=bump))
+        command = [sys.executable, "-m", "fd_mitsuba", "check", str(path)]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert "Traceback" not in result.stderr
+        told = result.stdout + result.stderr
+        assert f"{path}: Mitsuba cannot shade the base: Texture::eval_1_grad(): not implemented" in told
 
 
 @pytest.mark.parametrize("name", ["inv_flip", "mir_nonormals"])

@@ -132,10 +132,14 @@ def test_an_exported_scene_renders_alike_without_us(tmp_path: Path, mi: Any) -> 
 def test_every_way_to_store_bytes(tmp_path: Path, mi: Any, channels: str, of_faces: bool) -> None:
     path, values = coloured(tmp_path, channels=channels, of_faces=of_faces)
     scene = load_edit_scene(path)
-    face = 17
+    face, attribute = 17, "face_color" if of_faces else "vertex_color"
     rows = values[face] if of_faces else values[scene.base[0].faces[face]].mean(axis=0)
     assert albedo(scene, face, mi) == pytest.approx(rows[:3] / 255, abs=2e-3)
     assert not check_appearance_inputs(scene)
+    # Random alpha means something that cannot be kept.
+    assert [line.partition(": m.ply: ")[2] for line in scene.warnings] == (
+        [f"the alpha of {attribute} is left out; use a mask for what is to be see-through"] if "a" in channels else []
+    )
     glb = exported(scene, tmp_path / "out") / "asset.glb"
     found = accessor(glb, "COLOR_0")[:, :3]
     right = np.repeat(values[:, :3], 3, axis=0) / 255 if of_faces else values[:, :3] / 255
@@ -232,3 +236,18 @@ def test_what_mitsuba_warns_of_reaches_the_user(tmp_path: Path) -> None:
 
 def test_no_word_about_files_that_are_only_slow(make_scene: Any) -> None:
     assert load_edit_scene(make_scene()).warnings == ()  # an ASCII PLY
+
+
+def test_uvs_of_a_ply_run_the_other_way(mi: Any) -> None:
+    """As documented: one ball and one picture, upper half red in an OBJ and in a PLY with `flip_tex_coords`."""
+    upper = {}
+    for name in ("obj", "ply", "ply_flipped"):
+        scene = load_edit_scene(CASES / "ply_uv_upside_down" / f"{name}.xml")
+        loaded, (shape,) = base_shapes(scene)
+        surface = loaded.ray_intersect(mi.Ray3f([0.1, 0.7, 5.0], [0.0, 0.0, -1.0]))
+        upper[name] = np.array(shape.bsdf().eval_diffuse_reflectance(surface)).ravel()
+    assert upper["obj"][0] > 0.5 > upper["obj"][1]
+    assert upper["ply_flipped"] == pytest.approx(upper["obj"], abs=1e-3)
+    assert upper["ply"][1] > 0.5 > upper["ply"][0]
+    text = (Path(__file__).parents[2] / "docs" / "scene_format.md").read_text()
+    assert "flip_tex_coords" in text and "upside down" in text

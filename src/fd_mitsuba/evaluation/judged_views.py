@@ -80,7 +80,7 @@ def lit_views(stage: AppearanceStage, count: int, size: int, spp: int) -> Judged
     if dual.deferred_base:  # the ablation's pictures, but the masks of the two paths
         dual = AppearancePass(scene, stage.parts, shading, size, spp, depth)
     blank = TextureField(stage.config.texture, 0, stage.material.start, ())
-    solids = [scene.frame.to_user(np.asarray(mesh.vertices, np.float64)) for mesh in stage.parts.values()]
+    solids = [scene.render_frame.to_user(np.asarray(mesh.vertices, np.float64)) for mesh in stage.parts.values()]
     cameras = judged_cameras(count, stage.aim)
     rows: dict[str, list[Tensor]] = {name: [] for name in ("edited", "base", "start", "base_pixels", "untouched")}
     for first in range(0, count, _TOGETHER):

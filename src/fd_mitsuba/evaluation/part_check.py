@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from fd_mitsuba.export.part_record import part_file
+from fd_mitsuba.io.float_steps import is_coarse
 
 
 def check_parts(names: Iterable[str], folder: Path, scale: float) -> dict[str, dict]:
@@ -31,6 +32,8 @@ def _check(path: Path, scale: float) -> dict:
         mesh = None
     if mesh is None or not len(getattr(mesh, "faces", ())):
         return {"lost": True, "valid": False, "faces": 0, "closed": False, "pieces": 0, "volume": 0.0}
+    if is_coarse(mesh.vertices):  # products of three coordinates would leave no digits for the volume
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
     mesh.merge_vertices()
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
     volume = float(mesh.volume) * scale**3

@@ -45,7 +45,7 @@ def size_warnings(points: np.ndarray) -> list[str]:
     if step > _VISIBLE * size:
         place = f"its coordinates reach {np.abs(points).max():.3g}, where 32-bit floats are {step:.2g} apart"
         warnings.append(
-            f"{place}, {step / size:.2%} of its size, which shows in what Mitsuba and other programs make of it; "
+            f"{place}, {step / size:.2%} of its size, which shows in other programs and in plain Mitsuba; "
             "move everything to the origin"
         )
     if _RAY_OFFSET > _OFFSET_VISIBLE * size:

@@ -87,7 +87,7 @@ class AppearancePass:
             raise ValueError(f"size = {size}, spp = {spp}, max_depth = {max_depth}: at least 2, 1, and 2 or -1")
         self.size, self.spp, self.deferred_base = size, spp, deferred_base
         self.part_names = tuple(parts)
-        self._frame = scene.frame
+        self._frame = scene.render_frame
         self.scene = AppearanceScene.build(scene, parts, shading, max_depth != 2, opened)
         self._transport = LightTransport(self.scene.lit, max_depth)
         self._shading = FilmShading(shading)

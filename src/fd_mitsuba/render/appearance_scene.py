@@ -109,7 +109,7 @@ def _keep_at_distance(lights: list[Any], shapes: list[Any], scene: EditScene) ->
     bounds = mi.ScalarBoundingBox3f()
     for shape in shapes:
         bounds.expand(shape.bbox())
-    for corner in scene.frame.to_user(GRID_HALF_EXTENT * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])):
+    for corner in scene.render_frame.to_user(GRID_HALF_EXTENT * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])):
         bounds.expand(mi.ScalarPoint3f(*corner))
     middle, reach = np.array(bounds.center()), float(np.linalg.norm(np.array(bounds.extents()))) / 2
     room = _scene([mi.load_dict({"type": "sphere", "center": middle.tolist(), "radius": reach})])
@@ -131,6 +131,10 @@ def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | Non
         if element.plugin not in ANALYTIC:  # of these the file is in the user's frame
             names = ("to_world", "face_normals")
             description |= {name: element.properties[name] for name in names if name in element.properties}
+        if scene.origin.any():
+            matrix = np.array(description.get("to_world", mi.ScalarTransform4d()).matrix, dtype=np.float64)
+            matrix[:3, 3] -= scene.origin
+            description["to_world"] = mi.ScalarTransform4f(matrix.tolist())
         left.append(mi.load_dict(description, optimize=False))
     return left
 
@@ -145,7 +149,7 @@ def _part_mesh(name: str, solid: Triangles, scene: EditScene, shading: PartShadi
     for field in shading.feeds if shading else ():
         mesh.add_attribute(f"vertex_{field}", CHANNELS[field], [0.5] * (CHANNELS[field] * len(vertices)))
     parameters = mi.traverse(mesh)
-    parameters[VERTICES] = upload_floats(scene.frame.to_user(vertices))
+    parameters[VERTICES] = upload_floats(scene.render_frame.to_user(vertices))
     parameters[FACES] = upload_indices(faces)
     parameters.update()
     return mesh

@@ -89,9 +89,9 @@ def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None
 
 
 def _removed(scene: EditScene, folder: Path) -> list[np.ndarray] | None:
-    """Vertices (V, 3) of what was cut out, user frame; None for scenes that do not cut."""
+    """Vertices (V, 3) of what was cut out, in the frame of renders; None for scenes that do not cut."""
     paths = [folder / "export" / part_file(name) for name in scene.parts]
-    return [read_ply(path)[0] for path in paths if path.is_file()] if scene.subtracts else None
+    return [read_ply(path)[0] - scene.origin for path in paths if path.is_file()] if scene.subtracts else None
 
 
 def prepare_appearance(

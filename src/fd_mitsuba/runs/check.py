@@ -16,15 +16,13 @@ from fd_mitsuba.guidance.prompt_reader import PromptReading
 from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_prompt
 from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
-from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
+from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs, check_shading
 from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import FocalRegion
-from fd_mitsuba.scene.lit_side import shading_warnings
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.part_material import part_material
-from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid
-from fd_mitsuba.scene.scene_file import ready_mitsuba
+from fd_mitsuba.scene.region_place import gap_to_base, refuse_hidden_parts, share_in_grid
 from fd_mitsuba.scene.triangle_mesh import Topology, topology
 
 THINNEST_IN_CELLS = 3.0
@@ -122,7 +120,12 @@ class CheckReport:
 
 
 def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
-    """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written."""
+    """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written.
+
+    Raises:
+        UserError: what a run would refuse: a part all of whose regions lie within the base.
+    """
+    refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     reading, refusal = _prompt(scene, config)
     base = tuple(
         BaseCheck(mesh.name, len(mesh.vertices), len(mesh.faces), mesh.volume(), topology(mesh.vertices, mesh.faces))
@@ -279,8 +282,10 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
             warnings.append(f"no material can be learned, only a shape (--stage geometry): {error}")
     else:
         warnings.append("no emitter: previews use a lamp of their own; add an envmap for the appearance")
-        loaded, shapes = base_shapes(scene)
-        warnings += shading_warnings(ready_mitsuba(), loaded, shapes, scene.base)
+        try:
+            warnings += check_shading(scene, *base_shapes(scene))
+        except UserError as error:
+            warnings.append(str(error))
     warnings += misfits(config)
     if config.geometry.lambda_focal == 0:
         warnings.append("geometry.lambda_focal=0: nothing keeps the part in its region")

@@ -41,6 +41,7 @@ from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_wit
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.region_place import refuse_hidden_parts
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
@@ -124,6 +125,7 @@ def _run(
     started = time.monotonic()
     for warning in scene.warnings:
         say(warning)
+    refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     asked, with_assets = stages, "appearance" in stages
     if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
         if "geometry" not in stages:

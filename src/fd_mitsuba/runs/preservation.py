@@ -51,8 +51,8 @@ def measure_preservation(
 
     Args:
         with_part, alone: passes of the same scene, the second without any part.
-        solids: vertices (V, 3), user frame, of what takes or sends light; None: the parts of the first pass. Where
-            parts were cut out, these are what is gone.
+        solids: vertices (V, 3), in the frame of the renders, of what takes or sends light; None: the parts of the first
+            pass. Where parts were cut out, these are what is gone.
     """
     edited, base = (rendering.trace(cameras, 0, size=size, spp=spp) for rendering in (with_part, alone))
     pair = with_part.render_base(edited, 0) * exposure, alone.render_base(base, 0) * exposure

@@ -42,10 +42,10 @@ def check_appearance_inputs(scene: EditScene) -> tuple[str, ...]:
     """Warnings, a line each; a UserError for what would spoil the learned material, one line with element and remedy.
 
     Raises:
-        UserError: no emitter; a picture of the light or of a texture with NaN or infinity, or a light all black; a
-            light's scale that is not positive; a base that has a bitmap but no UVs, or names a mesh attribute that it
-            does not have; a base colour, reflectance, roughness, metallic or alpha outside [0, 1], as a number, in a
-            picture or in an attribute of the mesh.
+        UserError: no emitter; a BSDF of the base that Mitsuba loads but cannot render; a picture of the light or of a
+            texture with NaN or infinity, or a light all black; a light's scale that is not positive; a base that has a
+            bitmap but no UVs, or names a mesh attribute that it does not have; a base colour, reflectance, roughness,
+            metallic or alpha outside [0, 1], as a number, in a picture or in an attribute of the mesh.
     """
     warnings: list[str] = []
     inputs = scene.inputs()
@@ -68,7 +68,21 @@ def check_appearance_inputs(scene: EditScene) -> tuple[str, ...]:
     for element, shape in zip(base_elements(file), shapes, strict=True):
         if isinstance(shape, file.mi.Mesh):
             _check_textures(file, element, shape, warnings)
-    return (*warnings, *shading_warnings(file.mi, loaded, shapes, scene.base))
+    return (*warnings, *check_shading(scene, loaded, shapes))
+
+
+def check_shading(scene: EditScene, loaded: Any, shapes: list[Any]) -> list[str]:
+    """`lit_side.shading_warnings` of the scene as it was loaded, and the base's shapes in it.
+
+    Raises:
+        UserError: a BSDF that Mitsuba loads but cannot render.
+    """
+    file = scene.inputs().scene
+    try:
+        return shading_warnings(file.mi, loaded, shapes, scene.render_base)
+    except RuntimeError as error:
+        problem = str(file.translated(error)).removeprefix(f"{file.path}: ")
+        raise UserError(f"{scene.path}: Mitsuba cannot shade the base: {problem}") from None
 
 
 def _check_light(file: SceneFile, element: SceneElement, warnings: list[str]) -> None:

@@ -69,12 +69,12 @@ class BaseAppearance:
 
     def __init__(self, scene: EditScene) -> None:
         self._mi = ready_mitsuba()
-        self._frame = scene.frame
+        self._frame = scene.render_frame
         self._scene, shapes = base_shapes(scene)  # the shapes need their scene alive
         self._shapes = shapes
         meshes = [
             self._triangles(shape) if isinstance(shape, self._mi.Mesh) else (mesh.vertices, mesh.faces)
-            for shape, mesh in zip(shapes, scene.base, strict=True)
+            for shape, mesh in zip(shapes, scene.render_base, strict=True)
         ]
         self._first_face = np.cumsum([0] + [len(faces) for _, faces in meshes])
         first_vertex = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])

@@ -20,16 +20,32 @@ def double_positions(path: Path, vertices: np.ndarray) -> np.ndarray:
         path: the file.
         vertices: (V, 3) as Mitsuba has read them, without a `to_world`. What does not round to them is not used.
     """
-    readers = {".ply": _of_ply, ".obj": _of_obj}
-    reader = readers.get(path.suffix.lower())
-    try:
-        found = None if reader is None else reader(path)
-    except (OSError, ValueError, IndexError, KeyError):
-        found = None
+    found = read_positions(path)
     if found is None or found.shape != vertices.shape:
         return vertices
     near = np.abs(found - vertices) <= 2 * np.spacing(np.abs(vertices).astype(np.float32))
     return found if bool(near.all()) else vertices
+
+
+def read_positions(path: Path) -> np.ndarray | None:
+    """(V, 3) float64 of a PLY or an OBJ, None where they cannot be read."""
+    reader = {".ply": _of_ply, ".obj": _of_obj}.get(path.suffix.lower())
+    try:
+        return None if reader is None else reader(path)
+    except (OSError, ValueError, IndexError, KeyError):
+        return None
+
+
+def has_normals(path: Path) -> bool:
+    """Whether a PLY or an OBJ stores normals."""
+    header = read_ply_header(path)
+    if header is not None:
+        return any(item.name == "nx" for item in header.properties.get("vertex", ()))
+    try:
+        with open(path, "rb") as file:
+            return any(line.startswith(b"vn ") for line in file)
+    except OSError:
+        return False
 
 
 def _of_ply(path: Path) -> np.ndarray | None:

@@ -11,12 +11,16 @@ def without_reversed_copies(vertices: np.ndarray, faces: np.ndarray) -> np.ndarr
     Together the two cancel in a winding number, and the piece that they make has no inside. Corners are the same where
     their positions are equal. Copies that run the same way stay.
     """
-    place = _labels(vertices + 0.0)[faces]
+    hashes = _hashes(vertices + 0.0)
+    keys = np.sort(hashes[faces].sum(axis=1))  # of three corners in any order
+    if not (keys[1:] == keys[:-1]).any():
+        return faces
+    place = _labels(hashes)[faces]
     least = np.argmin(place, axis=1)[:, None]
     turned = np.take_along_axis(place, (least + np.arange(3)) % 3, axis=1)
     key, mirrored = turned, turned[:, [0, 2, 1]]
     low = np.where((turned[:, 1] < turned[:, 2])[:, None], key, mirrored)
-    labels = _labels(low)
+    labels = _labels(_hashes(low))
     forward = turned[:, 1] < turned[:, 2]
     count = int(labels.max(initial=-1)) + 1
     both = (np.bincount(labels[forward], minlength=count) > 0) & (np.bincount(labels[~forward], minlength=count) > 0)
@@ -28,12 +32,16 @@ def without_reversed_copies(vertices: np.ndarray, faces: np.ndarray) -> np.ndarr
     return faces[~proper | ~both[labels] | (forward == forward[first[labels]])]
 
 
-def _labels(rows: np.ndarray) -> np.ndarray:
-    """(N,) the same number for equal rows of three, in no order."""
-    words = np.ascontiguousarray(rows).view(np.uint64).astype(np.uint64)
-    # Hashes of 64 bits: sorting whole rows takes ten times as long, and two rows in a billion billion may be confused.
+def _labels(hashes: np.ndarray) -> np.ndarray:
+    """(N,) the same number for equal hashes, in no order."""
+    return np.unique(hashes, return_inverse=True)[1].reshape(-1)
+
+
+def _hashes(rows: np.ndarray) -> np.ndarray:
+    """(N,) uint64 of rows of three numbers of 64 bits: sorting whole rows takes ten times as long."""
+    words = np.ascontiguousarray(rows).view(np.uint64)
     mixed = np.zeros(len(rows), dtype=np.uint64)
     for column in range(3):
         mixed = (mixed ^ words[:, column]) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
-    return np.unique(mixed, return_inverse=True)[1].reshape(-1)
+    return mixed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
 from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
-from fd_mitsuba.scene.region_place import gap_to_base, hidden_regions, misplacement
+from fd_mitsuba.scene.region_place import gap_to_base, misplacement
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
@@ -93,6 +93,18 @@ class EditScene:
         return np.round(self.frame.centre) if is_coarse(used) else np.zeros(3)
 
     @cached_property
+    def render_frame(self) -> Normalisation:
+        """The map from the canonical frame to that in which Mitsuba renders: the user frame without `origin`."""
+        return self.frame if not self.origin.any() else Normalisation(self.frame.centre - self.origin, self.frame.scale)
+
+    @cached_property
+    def render_base(self) -> tuple[TriangleMesh, ...]:
+        """`base` in the frame in which Mitsuba renders."""
+        if not self.origin.any():
+            return self.base
+        return tuple(replace(mesh, vertices=mesh.vertices - self.origin) for mesh in self.base)
+
+    @cached_property
     def base_soup(self) -> TriangleMesh:
         """All base meshes as one, user frame, vertices not welded: for distances, not for export."""
         return _soup(self.base)
@@ -108,8 +120,8 @@ class EditScene:
         return EditInputs.open(self.path, self.regions_parameters | self.parameters, self.regions_path)
 
     def mitsuba_scene(self, without: tuple[str, ...] = ()) -> Any:
-        """The scene file as an `mi.Scene` in the user frame; see `SceneFile.instantiate`."""
-        return SceneFile(self.path, self.parameters).instantiate(without)
+        """The scene file as an `mi.Scene` in the render frame; see `SceneFile.instantiate`."""
+        return SceneFile(self.path, self.parameters).instantiate(without, self.origin)
 
 
 def load_edit_scene(
@@ -155,12 +167,8 @@ def load_edit_scene(
     soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
-    hidden = hidden_regions(found, distance)
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
-        problem = misplacement(region, gap, frame)
-        if problem is None and region.name in hidden:
-            problem = "lies wholly within the base, where nothing of the part is ever seen; move it outwards"
-        if problem:
+        if problem := misplacement(region, gap, frame):
             error = element.error(problem)
             if on_misplaced is None:
                 raise error

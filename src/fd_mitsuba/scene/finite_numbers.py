@@ -46,10 +46,13 @@ def refuse_broken_parameters(file: SceneFile, loaded: Any) -> None:
 
 
 def _broken_parameter(mi: Any, loaded: Any) -> str | None:
-    for key, value in mi.traverse(loaded).items():
-        if key.rpartition(".")[2] not in _PICTURES and not _finite(value):
-            return str(key)
-    return None
+    try:
+        found = list(mi.traverse(loaded).items())
+    except TypeError:  # some plugins of Mitsuba, such as `hair`, offer parameters that cannot be read
+        return None
+    return next(
+        (str(key) for key, value in found if key.rpartition(".")[2] not in _PICTURES and not _finite(value)), None
+    )
 
 
 def _finite(value: Any) -> bool:

@@ -113,19 +113,23 @@ def shading_warnings(mi: Any, loaded: Any, shapes: list[Any], meshes: tuple[Tria
 def _given_back(
     mi: Any, alone: Any, points: np.ndarray, side: np.ndarray, lift: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of a light of 1, (N, 3) what the BSDF gives back towards unit vectors `side`, and (N,) where it was found."""
+    """Of a light of 1, (N, 3) what the BSDF gives back towards unit vectors `side`, and (N,) where that can be told.
+
+    It cannot where the surface was not found, or is see-through.
+    """
     import drjit as dr
 
     ray = mi.Ray3f(_vector(mi.Point3f, points + lift * side), _vector(mi.Vector3f, -side))
     surface = alone.ray_intersect(ray)
     bsdf, context, valid = surface.bsdf(ray), mi.BSDFContext(), surface.is_valid() & (surface.t < 2 * lift)
-    weights = np.zeros((len(points), 3))
+    weights, opaque = np.zeros((len(points), 3)), np.zeros(len(points), dtype=bool)
     for one, two, three in np.random.default_rng(7).random((_DRAWS, 3, len(points))).astype(np.float32):
         sample, weight = bsdf.sample(context, surface, mi.Float(one), mi.Point2f(mi.Float(two), mi.Float(three)), valid)
         through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         found = np.array(dr.select(through, 0, weight)).T
         weights += (found if found.shape[1] == 3 else found[:, :1]) / _DRAWS
-    return weights, np.array(valid)
+        opaque |= ~np.broadcast_to(np.array(through), len(points))
+    return weights, np.array(valid) & opaque
 
 
 def _white(mi: Any, loaded: Any, points: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ class MeshNumbers:
     """What was put right in a loaded mesh.
 
     Attributes:
-        warnings: what is broken in the file, a sentence each.
+        warnings: what is broken in the file or left out, a sentence each.
         differs: whether plain Mitsuba would show the file otherwise.
         answered: starts of warnings of Mitsuba that are of no matter any more.
     """
@@ -62,7 +62,8 @@ def correct_mesh(file: SceneFile, element: SceneElement, mesh: Any) -> MeshNumbe
     warnings = [*_correct_uvs(parameters, name), *_correct_normals(parameters, name)]
     path = file.resolve(name)
     bytes_of = tuple(byte_attributes(path))
-    differs = _correct_attributes(file, element, mesh, path, bytes_of)
+    differs, lost = _correct_attributes(file, element, mesh, path, bytes_of)
+    warnings += lost
     answered = tuple(f'"{path.name}": Mesh attribute "{attribute}" has integer fields' for attribute in bytes_of)
     return MeshNumbers(tuple(str(element.error(line)) for line in warnings), differs or bool(warnings), answered)
 
@@ -122,9 +123,9 @@ def _correct_normals(parameters: Any, name: str) -> list[str]:
 
 def _correct_attributes(
     file: SceneFile, element: SceneElement, mesh: Any, path: Path, bytes_of: Collection[str]
-) -> bool:
-    """Whether one that the scene reads was misread."""
-    mi, scales, corrected = file.mi, attribute_scales(file, element), False
+) -> tuple[bool, list[str]]:
+    """Whether one that the scene reads was misread, and what of it is left out."""
+    mi, scales, corrected, lost = file.mi, attribute_scales(file, element), False, []
     parameters = mi.traverse(mesh)
     for name in [key for key in parameters.keys() if key.startswith(("vertex_", "face_")) and "." not in key]:
         if name in (VERTICES, NORMALS, UVS) or not mesh.has_attribute(name)[0]:
@@ -148,13 +149,15 @@ def _correct_attributes(
             if not any(raw):
                 rows, corrected = rows / np.float32(255), True
         if rows.shape[1] == 4:
+            if np.ptp(rows[:, 3]) > 0:
+                lost.append(f"{path.name}: the alpha of {name} is left out; use a mask for what is to be see-through")
             rows, corrected = rows[:, :3], True
         if rows.shape[1] not in (1, 3):
             raise element.error(f"{path.name}: {name} has {rows.shape[1]} channels; save it as one number or as RGB")
         if not np.array_equal(rows.ravel(), values):
             mesh.remove_attribute(name)
             mesh.add_attribute(name, rows.shape[1], np.ascontiguousarray(rows, dtype=np.float32).ravel())
-    return corrected
+    return corrected, lost
 
 
 def byte_attributes(path: Path) -> Iterator[str]:

@@ -20,13 +20,19 @@ def mitsuba_warnings(mi: Any) -> Iterator[list[str]]:
     """A list that holds, once the block has ended, what Mitsuba warned of in it; each sentence once.
 
     They go through a file and not through a logger in Python: threads of Mitsuba would wait for the interpreter, and
-    the interpreter for them. Warnings about speed alone are left out.
+    the interpreter for them. Where there is no room for a file, nothing is collected. Warnings about speed alone are
+    left out.
     """
     found: list[str] = []
     logger = mi.logger()
     before = [logger.appender(number) for number in range(logger.appender_count())]
     level = logger.log_level()
-    with tempfile.NamedTemporaryFile(suffix=".log") as file:
+    try:
+        file = tempfile.NamedTemporaryFile(suffix=".log")
+    except OSError:
+        yield found
+        return
+    with file:
         collector = mi.StreamAppender(file.name)
         logger.clear_appenders()
         logger.add_appender(collector)

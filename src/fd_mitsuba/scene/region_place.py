@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
@@ -28,14 +31,19 @@ def misplacement(region: FocalRegion, gap: float, frame: Normalisation) -> str |
     return None
 
 
-def hidden_regions(regions: tuple[FocalRegion, ...], base: MeshDistance) -> set[str]:
-    """Names of the regions that lie wholly within the base and so do all others of their part, which is to be added."""
-    within = {
-        region.name: region.mode != SUBTRACT and bool(base.inside(region.surface(3).vertices).all())
-        for region in regions
-    }
-    seen = {region.part for region in regions if not within[region.name]}
-    return {region.name for region in regions if region.part not in seen}
+def refuse_hidden_parts(path: Path, regions: tuple[FocalRegion, ...], base: TriangleMesh) -> None:
+    """UserError if all regions of a part that is to be added lie wholly within the base, where nothing is ever seen.
+
+    Args:
+        path: the scene, for the message.
+        base: in the canonical frame.
+    """
+    distance = MeshDistance(base.vertices, base.faces)
+    for part in dict.fromkeys(region.part for region in regions):
+        own = [region for region in regions if region.part == part]
+        if all(region.mode != SUBTRACT and distance.inside(region.surface(3).vertices).all() for region in own):
+            where = "lies wholly within the base, where nothing of the part is ever seen; move it outwards"
+            raise UserError(f"{path}: region {own[0].name}: {where}")
 
 
 def share_in_grid(region: FocalRegion, samples: int = 24) -> float:

@@ -11,10 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fd_mitsuba.backend import startup
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS, one_line
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.centred import move_nodes, restore_digits
 from fd_mitsuba.scene.file_faults import fault_of_file
 from fd_mitsuba.scene.file_gate import check_meshes, opened_files, refuse_incomplete
 from fd_mitsuba.scene.mesh_numbers import correct_mesh
@@ -111,11 +114,13 @@ class SceneFile:
         """The elements of one kind directly below `<scene>`, in file order."""
         return [element for element in self.elements if element.top_level and element.kind == kind]
 
-    def instantiate(self, without: tuple[str, ...] = ()) -> Any:
+    def instantiate(self, without: tuple[str, ...] = (), origin: np.ndarray | None = None) -> Any:
         """The `mi.Scene`, with meshes and BSDFs kept apart (nothing merged) and ids as in the file.
 
         Args:
             without: top-level objects to leave out, by kind or plugin type, such as ("focal_region", "sensor").
+            origin: (3,) the point of the file's frame that is at the scene's origin, for scenes that lie so far away
+                that 32-bit floats show; None: the file's own.
 
         Raises:
             UserError: a mesh that would break Mitsuba; a plugin that fails, is unknown, or does not know a property.
@@ -126,6 +131,9 @@ class SceneFile:
             if without:
                 self._drop(state, without)
             self._find_copies(state)
+            if origin is not None and np.any(origin):
+                root = state.root.props
+                move_nodes(self.mi, [state.nodes[self._index(root, key)] for key in self._links(root)], origin)
             try:
                 with file_threads(), mitsuba_warnings(self.mi) as said:
                     scene = self.mi.parser.instantiate(self._config(), state)
@@ -135,7 +143,9 @@ class SceneFile:
             kept = [shape for shape in self.top_level("shape") if not {shape.kind, shape.plugin} & set(without)]
             shapes = scene.shapes() if kept else []
             # A plugin that makes several shapes of one, such as `merge`, leaves nothing to say which is whose.
-            pairs = zip(kept, shapes, strict=True) if len(kept) == len(shapes) else ()
+            pairs = list(zip(kept, shapes, strict=True)) if len(kept) == len(shapes) else []
+            if origin is not None and np.any(origin):
+                restore_digits(self, scene, pairs, origin)
             numbers = [correct_mesh(self, element, shape) for element, shape in pairs]
             answered = tuple(start for item in numbers for start in item.answered)
             told = (f"{self.path}: Mitsuba: {line}" for line in said if not line.startswith(answered))

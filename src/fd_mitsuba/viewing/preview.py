@@ -64,7 +64,7 @@ def _base_pictures(scene: EditScene, cameras: CameraBatch, size: int) -> tuple[n
     """sRGB pictures (B, 2 size, 2 size, 3) in [0, 1] on paper, and the base's distance (canonical units)."""
     file = SceneFile(scene.path, scene.parameters)
     mi = file.mi
-    loaded = file.instantiate(without=("focal_region", "sensor", "integrator"))
+    loaded = file.instantiate(without=("focal_region", "sensor", "integrator"), origin=scene.origin)
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
     radiance, cover = [], []
     for index in range(len(cameras)):
@@ -94,7 +94,7 @@ def _lit(mi: Any, loaded: Any, scene: EditScene, cameras: CameraBatch, index: in
 
 
 def _sensor(mi: Any, scene: EditScene, cameras: CameraBatch, index: int, size: int) -> Any:
-    position, target = scene.frame.to_user(cameras.position[index]), scene.frame.to_user(cameras.target[index])
+    position, target = (scene.render_frame.to_user(point[index]) for point in (cameras.position, cameras.target))
     up = cameras.basis()[1][index]
     reach = 3.0 / scene.frame.scale
     return mi.load_dict(
@@ -137,7 +137,7 @@ def _hit(
     origin, direction = _rays(cameras, index, pixels)
     scale = 1.0
     if scene is not None:
-        origin, scale = scene.frame.to_user(origin), scene.frame.scale
+        origin, scale = scene.render_frame.to_user(origin), scene.frame.scale
     ray = mi.Ray3f(mi.Point3f(*origin.tolist()), mi.Vector3f(np.ascontiguousarray(direction.T, dtype=np.float32)))
     surface = loaded.ray_intersect(ray)
     valid = np.array(surface.is_valid()).reshape(pixels, pixels)
