@@ -21,7 +21,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2] / "src")]
 
 from fuzz.forked import ALLOWED, HANG, OTHER, REFUSED, SIGNAL, TRACEBACK, USAGE, WORKS, Forked, Outcome
-from fuzz.mutators import KINDS, Mutator
+from fuzz.mutators import KINDS, LONG_KINDS, Mutator
 from fuzz.run_folders import run_folder
 from fuzz.seeds import small_exr, write_seeds
 
@@ -60,7 +60,7 @@ class Fuzzer:
 
     def __init__(self, seed: int, with_run: bool = False, keep: Path | None = None) -> None:
         self.seed, self.with_run, self.keep = seed, with_run, keep
-        self.kinds: dict[str, Mutator] = KINDS | ({RUN_FOLDERS: run_folder} if with_run else {})
+        self.kinds: dict[str, Mutator] = KINDS | LONG_KINDS | ({RUN_FOLDERS: run_folder} if with_run else {})
 
     def __enter__(self) -> Fuzzer:
         self._place = tempfile.TemporaryDirectory(prefix="fuzz-")
@@ -154,7 +154,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", "--count", type=int, default=500, help="cases; default: 500")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
-    parser.add_argument("--kind", action="append", choices=[*KINDS, RUN_FOLDERS], help="default: all in turn")
+    parser.add_argument(
+        "--kind", action="append", choices=[*KINDS, *LONG_KINDS, RUN_FOLDERS], help="default: all in turn"
+    )
     parser.add_argument("--only", type=int, help="this case of the kind alone")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the inputs there")
     parser.add_argument("--workers", type=int, default=1, help="default: 1")

@@ -10,6 +10,7 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
+from fuzz.plugin_values import plugin_values
 from fuzz.seeds import obj_bytes, ply_bytes, serialized_bytes, sphere_arrays
 
 NUMBERS = (
@@ -217,7 +218,8 @@ def mesh_values(rng: Random, folder: Path) -> list[str]:
             vertices, uv = vertices[: rng.choice([0, 1, 3, 20])], uv[: rng.choice([0, 1, 3, 20])]
             uv = np.resize(uv, (len(vertices), 2))
         else:
-            vertices *= rng.choice([0.0, 1e-30, 1e18, -1.0])
+            with np.errstate(invalid="ignore"):
+                vertices *= rng.choice([0.0, 1e-30, 1e18, -1.0])
         if not len(faces) or not len(vertices):
             break
     kind = rng.choice(["body.ply", "body.ply", "more/lamp.ply", "head.obj", "head.serialized"])
@@ -311,13 +313,22 @@ def arguments(rng: Random, folder: Path) -> list[str]:
     return [item for item, before in zip(given, ["", *given[:-1]], strict=True) if not {item, before} & unsafe]
 
 
+def previews(rng: Random, folder: Path) -> list[str]:
+    """Any of the faults of scenes and their files, in front of a command that renders."""
+    rng.choice([scene_elements, plugin_values, plugin_values, mesh_values, pictures])(rng, folder)
+    return ["preview", str(folder / "scene.xml"), "-o", str(folder / "preview")]
+
+
 KINDS: dict[str, Mutator] = {
     "bytes of a scene": scene_bytes,
     "elements of a scene": scene_elements,
     "plugins": plugins,
+    "values of plugins": plugin_values,
     "bytes of a mesh": mesh_bytes,
     "values of a mesh": mesh_values,
     "pictures": pictures,
     "settings": settings,
     "arguments": arguments,
 }
+"""The cheap kinds: a tenth of a second each."""
+LONG_KINDS: dict[str, Mutator] = {"previews": previews}

@@ -263,6 +263,17 @@ def test_picture_of_too_many_pixels(forked: Forked, make_scene: Make, tmp_path: 
     assert outcome.megabytes < 600
 
 
+@pytest.mark.parametrize(
+    "data", [b"PF\n8 0x10\n-1.0\n" + bytes(384), b"PF\n8 0\n-1.0\n", b"P6\n0 4\n255\n", b"#?RADIANCE\n\n-Y x +X 4\n",
+             _png(4, 4)[:20], _exr(0, 4), b"\xff\xd8\xff\xe0\0", b"BM" + bytes(100), b"PF\n"]
+)  # fmt: skip
+def test_a_picture_without_a_size(forked: Forked, make_scene: Make, tmp_path: Path, data: bytes) -> None:
+    """Mitsuba divides by the number of its rows, and the process ends."""
+    (tmp_path / "sky").write_bytes(data)
+    light = '<emitter type="envmap" id="sky"><string name="filename" value="sky"/></emitter>'
+    refused(forked.run("check", make_scene(light=light)), "scene.xml:7:", "sky", "how large the picture is")
+
+
 def test_a_picture_within_the_limit_is_read(forked: Forked, make_scene: Make, tmp_path: Path) -> None:
     (tmp_path / "sky.png").write_bytes(_png(512, 256))
     light = '<emitter type="envmap" id="sky"><string name="filename" value="sky.png"/></emitter>'

@@ -70,6 +70,8 @@ def one_line(
     text = re.sub(r" in property \"_arg_\d+\"|Make sure the object with .*$|\(previous was at .*$", "", text)
     text = re.sub(r"\n\s*-\s*", " ", _LOGGER.sub("", text))
     text = " ".join(text.replace(_SCENE, str(path)).split()).strip(" .!;:")
+    if text == "stof":
+        text = "a number does not fit into 32 bits"
     remedy = remedy_for(text)
     unknown = re.search(r'Plugin "([^"]*)" not found', text)
     if unknown and (near := _nearest_plugin(mi, unknown.group(1))):

@@ -7,13 +7,13 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-_HEAD = 1 << 16
+_HEAD = 1 << 20
 
 
 def picture_size(path: Path) -> tuple[int, int] | None:
-    """Pixels across and down of a PNG, JPEG, EXR, HDR, PFM, PPM, BMP or TGA; None where the header does not say.
+    """Pixels across and down of a PNG, JPEG, EXR, HDR, PFM, PPM, BMP or TGA; None for any other file.
 
-    Of an EXR with several parts, the largest.
+    Of an EXR with several parts, the largest. (0, 0) where the header cannot be understood.
 
     Raises:
         OSError: the file cannot be read.
@@ -23,7 +23,7 @@ def picture_size(path: Path) -> tuple[int, int] | None:
         try:
             return _size(head, file)
         except (struct.error, ValueError, IndexError):
-            return None
+            return 0, 0
 
 
 def _size(head: bytes, file: BinaryIO) -> tuple[int, int] | None:
@@ -36,12 +36,12 @@ def _size(head: bytes, file: BinaryIO) -> tuple[int, int] | None:
     if head.startswith(b"#?"):
         found = re.search(rb"\n\s*([+-][XY]) +(\d{1,10}) +([+-][XY]) +(\d{1,10})\s*\n", head)
         if not found:
-            return None
+            return 0, 0
         first, second = int(found.group(2)), int(found.group(4))
         return (second, first) if found.group(1)[1:] == b"Y" else (first, second)
     if head[:2] in (b"PF", b"Pf", b"P6"):
-        numbers = re.sub(rb"#[^\n]*", b"", head[2:256]).split()
-        return int(numbers[0]), int(numbers[1])
+        numbers = re.sub(rb"#[^\n]*", b"", head[2:4096]).split()
+        return int(numbers[0].decode("ascii")), int(numbers[1].decode("ascii"))
     if head.startswith(b"BM"):
         width, height = struct.unpack("<ii", head[18:26])
         return abs(width), abs(height)
@@ -54,23 +54,23 @@ def _size(head: bytes, file: BinaryIO) -> tuple[int, int] | None:
     return None
 
 
-def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
+def _jpeg(file: BinaryIO) -> tuple[int, int]:
     file.seek(2)
     for _ in range(1000):
         marker = file.read(2)
         while len(marker) == 2 and marker[1] == 0xFF:
             marker = marker[1:] + file.read(1)
         if len(marker) < 2 or marker[0] != 0xFF:
-            return None
+            return 0, 0
         length = struct.unpack(">H", file.read(2))[0]
         if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
             _, height, width = struct.unpack(">BHH", file.read(5))
             return width, height
         file.seek(length - 2, 1)
-    return None
+    return 0, 0
 
 
-def _exr(head: bytes) -> tuple[int, int] | None:
+def _exr(head: bytes) -> tuple[int, int]:
     """The largest of the windows of data; a header is a list of named attributes and ends with an empty name."""
     sizes = []
     several = bool(struct.unpack("<I", head[4:8])[0] & 0x1000)
@@ -91,4 +91,4 @@ def _exr(head: bytes) -> tuple[int, int] | None:
             left, top, right, bottom = struct.unpack("<iiii", head[value : value + 16])
             sizes.append((right - left + 1, bottom - top + 1))
         place = value + length
-    return max(sizes, key=lambda size: size[0] * size[1], default=None)
+    return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))

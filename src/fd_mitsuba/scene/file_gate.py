@@ -32,13 +32,20 @@ _NEED_FILE = (
     *_PICTURES, *FILE_SHAPES.values(), "gridvolume", "sdfgrid", "measured", "measured_polarized", "bsplinecurve",
     "linearcurve", "ellipsoids", "ellipsoidsmesh",
 )  # fmt: skip
+_ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 _CONDUCTORS = ("conductor", "roughconductor")
 
 _sound_meshes: set[tuple[object, ...]] = set()
 
 
 def refuse_incomplete(elements: Sequence[SceneElement]) -> None:
-    """Raise UserError for an element without what Mitsuba takes for granted, and crashes where it is not there."""
+    """Raise UserError for an element without what Mitsuba takes for granted, and crashes where it is not there.
+
+    Likewise for a second one of what there can be only one of, where Mitsuba does not say which.
+    """
+    environments = [element for element in elements if element.kind == "emitter" and element.plugin in _ENVIRONMENTS]
+    if len(environments) > 1:
+        raise environments[1].error("is a second environment; keep one")
     for element in elements:
         if element.plugin in _NEED_FILE and not element.properties.get("filename"):
             raise element.error('has no filename; write <string name="filename" value="..."/>')
@@ -134,8 +141,10 @@ def _names(element: SceneElement) -> list[str]:
 def _check_content(element: SceneElement, name: str, path: Path) -> None:
     try:
         if element.plugin in _PICTURES:
-            width, height = picture_size(path) or (0, 0)
-            if width * height > MAX_PIXELS or width < 0 or height < 0:
+            width, height = picture_size(path) or (1, 1)  # whatever else it is, Mitsuba says
+            if min(width, height) < 1:
+                raise BrokenHeader("its header does not say how large the picture is")
+            if width * height > MAX_PIXELS:
                 limit = f"{MAX_PIXELS // 1_000_000} million"
                 raise element.error(f"{name} has {width} x {height} pixels, more than {limit}; shrink it")
             return
