@@ -32,6 +32,8 @@ from fd_mitsuba.prior.judging.part_judge import (
     views_of,
 )
 from fd_mitsuba.prior.pictures.corpus import Pair, RayCaster, make_pairs, shade
+from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs
+from fd_mitsuba.prior.training.kinds import GEOMETRY_FINE
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.region_place import share_in_grid
 
@@ -236,3 +238,15 @@ def test_a_classifier_of_other_words_keeps_them(tmp_path: Path) -> None:
     said = judge(views.before[:3] / np.float32(127), views.after[:3] / np.float32(127))
     assert said.shape == (3, len(names))
     assert seen_by_judge(np.ones((2, 4, 64, 64), np.float32)).shape == (2, 4, 32, 32)
+
+
+def test_a_prompt_that_takes_a_part_away_is_judged_by_what_is_left() -> None:
+    pairs = [pair for seed in range(4) for pair in make_fine_pairs("elephant", ["crown", "tusks", "wings"], seed)]
+    removed = next(pair for pair in pairs if pair.removed)
+    wanted, before = (latent / np.float32(127) for latent in (removed.edited, removed.base))
+    gone, still = (judge_sample(removed, picture, SaysPart(), kind=GEOMETRY_FINE) for picture in (wanted, before))
+    assert (gone.taken_off, still.taken_off) == (True, False) and gone.found is gone.part is None
+    added = next(pair for pair in pairs if not pair.removed)
+    assert judge_sample(added, added.edited / np.float32(127), None, kind=GEOMETRY_FINE).taken_off is None
+    report = summary([gone, still])
+    assert report["removal"] == {"samples": 2, "taken_off": 0.5} and report["plain"]["samples"] == 0

@@ -39,8 +39,8 @@ def handle(surface: Surface, rng: Rng) -> Zones:
 def skateboard(surface: Surface, rng: Rng) -> Zones:
     """A deck with raised ends, two trucks with axles, four wheels, under the feet."""
     body = surface.body
-    half_x, half_z = max(body.foot_x * 1.1, 0.22), max(body.foot_z * jitter(rng, 1.3), 0.55)
-    half_x = min(half_x, 0.5 * half_z)
+    half_x = max(body.foot_x * 1.1, 0.22)
+    half_z = max(body.foot_z * jitter(rng, 1.3), 0.55, 1.55 * half_x)
     thick, wheel = 0.045, jitter(rng, 0.105, 0.08)
     z = np.linspace(-1, 1, 21) * half_z
     rise = 0.22 * half_z * (np.clip(np.abs(z) / half_z - 0.68, 0, None) / 0.32) ** 1.5
