@@ -165,6 +165,8 @@ def test_obj_names_materials_and_maps(make_scene: Make, tmp_path: Path) -> None:
     for word in ("map_Kd", "map_Pr", "map_Pm", "norm"):
         line = next(line for line in material.splitlines() if line.startswith(f"{word} "))
         assert (folder / line.split()[-1]).is_file()
+    # Blender makes the strength of a normal map of -bm, and takes 0 where there is none.
+    assert next(line for line in material.splitlines() if line.startswith("map_Bump ")).startswith("map_Bump -bm 1 ")
     assert not (tmp_path / "out" / "asset.glb").exists()
 
 

@@ -85,15 +85,10 @@ def test_a_run_folder_is_enough_for_an_export(run_folder: Path, tmp_path: Path, 
     run_folder.rename(moved)
     for name in ("scene.xml", "animal.ply"):
         (tmp_path / name).unlink()
-    for name in ("glb", "obj", "ply", "mitsuba"):
-        (moved / "export" / before_name(name)).unlink()
+    for name in ("asset.glb", "obj/asset.obj", "ply/part_part.ply", "mitsuba/scene.xml"):
+        (moved / "export" / name).unlink()
     capfd.readouterr()
     assert main(["export", str(moved)]) == 0
     said = capfd.readouterr().err
     assert f"taking the copy of it in {moved / 'scene'}" in said
     assert {name: (moved / name).read_bytes() for name in before} == before
-
-
-def before_name(kind: str) -> str:
-    names = {"glb": "asset.glb", "obj": "obj/asset.obj", "ply": "ply/part_part.ply", "mitsuba": "mitsuba/scene.xml"}
-    return names[kind]

@@ -1,6 +1,7 @@
 """Exports in programs of others: Blender and a browser. Slow, and skipped where these are not installed.
 
-Blender is Debian's package with python3-numpy; the browser needs chromium and `npm install` in tools/viewers.
+Blender is Debian's package with python3-numpy, whose missing `np.bool` blender_import.py puts back; the browser needs
+chromium and `npm install` in tools/viewers.
 """
 
 from __future__ import annotations

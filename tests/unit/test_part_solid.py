@@ -266,32 +266,6 @@ def test_moved_vertices_keep_it_manifold() -> None:
     check(part_solid(stage, None))
 
 
-@pytest.mark.parametrize("faces", [2000, 600])
-def test_decimated_solids_stay_solid(faces: int) -> None:
-    solid = part_solid(stage_of({"part": [((0.0, 0.62, 0.0), 0.25)]}), None)
-    assert len(solid.faces) > 3000 and solid.decimated(10**6) is solid
-    small = solid.decimated(faces)
-    check(small)
-    assert len(small.faces) <= faces
-    assert small.volume == pytest.approx(solid.volume, rel=0.02)
-    away = MeshDistance(solid.vertices, solid.faces).unsigned(small.vertices)
-    assert away.max() < 0.01
-    assert small.gap(base_mesh()) == 0.0
-
-
-def test_decimation_that_breaks_the_solid_is_done_the_other_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    import fast_simplification
-
-    def torn(points: np.ndarray, faces: np.ndarray, **_: object) -> tuple[np.ndarray, np.ndarray]:
-        return points, faces[:100]
-
-    monkeypatch.setattr(fast_simplification, "simplify", torn)
-    solid = part_solid(stage_of({"part": [((0.0, 0.62, 0.0), 0.25)]}), None)
-    small = solid.decimated(1000)
-    check(small)
-    assert len(small.faces) <= 1000 and small.volume == pytest.approx(solid.volume, rel=0.02)
-
-
 @pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.6, 0.0, 0.8), (-0.48, -0.6, 0.64)])
 @pytest.mark.parametrize("height", [0.62, 0.9])
 def test_the_anchor_is_where_the_part_meets_the_base(direction: tuple[float, ...], height: float) -> None:

@@ -119,8 +119,9 @@ def _material_lines(name: str, material: PbrMaterial, files: dict[str, bytes]) -
             lines.append(f"{word} {_options(material.orm_picture)}{_put(files, picture)}")
     if material.normal_picture is not None:
         place = f"{_options(material.normal_picture)}{_put(files, material.normal_picture)}"
-        # `norm` is the PBR extension's word, `map_Bump` is the one that more programs know.
-        lines += [f"norm {place}", f"map_Bump {place}"]
+        # `norm` is the PBR extension's word, `map_Bump` is the one that more programs know. Blender takes the strength
+        # of the map from `-bm`, and without it 0.
+        lines += [f"norm {place}", f"map_Bump -bm 1 {place}"]
     return [*lines, ""]
 
 

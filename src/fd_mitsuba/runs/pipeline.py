@@ -13,8 +13,9 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.part_record import part_record
+from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_solid import part_solid
-from fd_mitsuba.export.solid.solid import LEAST_FACES
+from fd_mitsuba.export.solid.solid import LEAST_FACES, Solid
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import Guidance
@@ -48,6 +49,7 @@ from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import OnStep
 
 STAGES = ("geometry", "appearance")
+_VOLUME_CHANGE_SAID = 0.05
 
 
 class SaysWhatItSees(Protocol):
@@ -246,7 +248,7 @@ def write_assets(
     scene = geometry.scene
     solids = {name: part_solid(geometry, name) for name in scene.parts}
     if faces is not None:
-        solids = {name: solid.decimated(faces) for name, solid in solids.items()}
+        solids = {name: _within_budget(name, solid, faces, say) for name, solid in solids.items()}
     cut = cut_out(scene, solids) if scene.subtracts else None
     if cut is not None:
         solids = removed_parts(scene, cut)
@@ -255,3 +257,14 @@ def write_assets(
     write_json(folder / "export" / "part.json", part_record(scene, solids, opened))
     export = folder / "export"
     return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
+
+
+def _within_budget(name: str, solid: Solid, faces: int, say: Callable[[str], None]) -> Solid:
+    """The part with at most `faces` faces; `say` hears where the shape needs more, or has suffered."""
+    small = decimated(solid, faces)
+    kept = small.volume / solid.volume if solid.volume > 0 else 1.0
+    if len(small.faces) > faces:
+        say(f"--faces {faces}: part {name!r} keeps {len(small.faces)} faces; with fewer it would fall apart")
+    elif abs(kept - 1) > _VOLUME_CHANGE_SAID:
+        say(f"--faces {faces}: part {name!r} has {kept:.0%} of its volume left; allow more faces for a truer shape")
+    return small

@@ -20,6 +20,8 @@ MOST_DECIBELS = 200.0
 """What equal images are given, so that the metric stays a number in JSON."""
 
 _POINTS_AT_ONCE = 16384
+_PRODUCTS_AT_ONCE = 1 << 24
+"""Of a point and a corner; a part that is still its region has thousands of corners."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,9 @@ def light_may_be_touched(gbuffer: GBuffer, solids: Sequence[np.ndarray]) -> torc
         points, normals = np.array(surface.p).T.astype(np.float64), np.array(facing).T.astype(np.float64)
         corners = np.concatenate([vertices[ConvexHull(vertices).vertices] for vertices in solids])
         height = -np.einsum("ij,ij->i", normals, points)
-        for start in range(0, len(points), _POINTS_AT_ONCE):
-            some = slice(start, start + _POINTS_AT_ONCE)
+        together = max(256, min(_POINTS_AT_ONCE, _PRODUCTS_AT_ONCE // max(len(corners), 1)))
+        for start in range(0, len(points), together):
+            some = slice(start, start + together)
             height[some] += (normals[some] @ corners.T).max(axis=1)
         touched[np.array(samples.lane)[height > 0] // gbuffer.spp] = True
     return torch.from_numpy(touched).reshape(views, 1, size, size)

@@ -1,11 +1,10 @@
-"""A closed triangle solid: its volume, whether it is manifold, its gap to the base, fewer faces."""
+"""A closed triangle solid: its volume, whether it is manifold, its gap to the base."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import fast_simplification
 import manifold3d
 import numpy as np
 from scipy.sparse import coo_array
@@ -16,9 +15,6 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
 LEAST_FACES = 100
 """A smaller face budget leaves no shape to speak of."""
-
-_VOLUME_KEPT = 0.02
-"""A decimation that changes the volume by more than this share has destroyed something."""
 
 
 @dataclass(frozen=True)
@@ -91,37 +87,3 @@ class Solid:
             enters = distance.inside(points).any() or MeshDistance(self.vertices, faces).inside(base.vertices).any()
             gaps.append(0.0 if enters else float(distance.unsigned(points).min()))
         return max(gaps)
-
-    def decimated(self, faces: int) -> Solid:
-        """The solid with at most `faces` faces or as few as stay a solid; unchanged where it has no more than that.
-
-        Quadric edge collapses, and where these break the solid or its volume, manifold3d's own, slower and plainer.
-        """
-        if len(self.faces) <= faces or not len(self.faces):
-            return self
-        points, triangles = fast_simplification.simplify(
-            self.vertices, self.faces.astype(np.int32), target_count=faces, agg=5.0
-        )
-        made = replace(self, vertices=points, faces=triangles)
-        if made.manifold and abs(made.volume - self.volume) <= _VOLUME_KEPT * self.volume:
-            return made
-        return self._merged(faces)
-
-    def _merged(self, faces: int) -> Solid:
-        """Bisects the tolerance, the only measure that manifold3d takes, for the number of faces."""
-        whole = self.to_manifold()
-        low, high = 0.0, float(np.ptp(self.vertices, axis=0).max()) / 10
-        best = None
-        for _ in range(16):
-            middle = (low + high) / 2
-            made = whole.simplify(middle)
-            if made.num_tri() > faces:
-                low = middle
-                continue
-            high = middle
-            if made.num_tri():
-                best = made
-        if best is None:
-            return self
-        mesh = best.to_mesh()
-        return replace(self, vertices=mesh.vert_properties[:, :3], faces=mesh.tri_verts)

@@ -1,0 +1,72 @@
+"""Fewer faces for a solid: the budget is kept, the solid stays one, and what cannot be done is told."""
+
+from __future__ import annotations
+
+import fast_simplification
+import numpy as np
+import pytest
+import trimesh
+
+from fd_mitsuba.export.solid.decimation import decimated
+from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.runs.pipeline import _within_budget
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+
+
+def ball(scale: tuple[float, float, float] = (0.25, 0.25, 0.25), level: int = 4) -> Solid:
+    mesh = trimesh.creation.icosphere(level)
+    return Solid(mesh.vertices * scale, mesh.faces)
+
+
+def leaves() -> Solid:
+    """Two bent sheets, a hundredth as thick as they are wide: their sides come to touch when faces are few."""
+    mesh = trimesh.creation.icosphere(5)
+    points = mesh.vertices * (0.4, 0.004, 0.25)
+    points[:, 1] += 0.6 * points[:, 0] ** 2
+    other = points + (0.0, 0.3, 0.0)
+    return Solid(np.concatenate([points, other]), np.concatenate([mesh.faces, mesh.faces + len(points)]))
+
+
+CASES = [(ball, 2000), (ball, 600), (ball, 200), (ball, 100), (leaves, 1100), (leaves, 600)]
+
+
+@pytest.mark.parametrize(("shape", "faces"), CASES)
+def test_the_budget_is_kept_and_the_solid_stays_one(shape, faces: int) -> None:
+    solid = shape()
+    small = decimated(solid, faces)
+    assert small.manifold and 0.7 * faces <= len(small.faces) <= faces
+    away = MeshDistance(solid.vertices, solid.faces).unsigned(small.vertices)
+    assert away.max() < 0.02 and small.pieces().max() == solid.pieces().max()
+    assert small.volume == pytest.approx(solid.volume, rel=0.02 if faces >= 600 and shape is ball else 0.5)
+
+
+def test_enough_is_left_as_it_is() -> None:
+    solid = ball()
+    assert decimated(solid, len(solid.faces)) is solid and decimated(solid, 10**6) is solid
+
+
+def test_what_cannot_be_made_smaller_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def torn(points: np.ndarray, faces: np.ndarray, **_: object) -> tuple[np.ndarray, np.ndarray]:
+        return points, faces[:100]
+
+    said: list[str] = []
+    monkeypatch.setattr(fast_simplification, "simplify", torn)
+    solid = ball()
+    assert _within_budget("wing", solid, 1000, said.append) is solid
+    assert len(said) == 1 and f"part 'wing' keeps {len(solid.faces)} faces" in said[0]
+
+
+def test_a_shape_that_needs_more_faces_gets_them_and_that_is_told() -> None:
+    said: list[str] = []
+    small = _within_budget("leaves", leaves(), 100, said.append)
+    assert small.manifold and 100 < len(small.faces) < 1000
+    assert said == [f"--faces 100: part 'leaves' keeps {len(small.faces)} faces; with fewer it would fall apart"]
+
+
+def test_a_shape_that_suffers_is_told() -> None:
+    said: list[str] = []
+    ring = trimesh.creation.torus(0.3, 0.05, 120, 40)
+    small = _within_budget("ring", Solid(ring.vertices, ring.faces), 150, said.append)
+    assert len(small.faces) <= 150 and len(said) == 1 and "of its volume left" in said[0]
+    _within_budget("wing", ball(level=5), 2000, said.append)
+    assert len(said) == 1
