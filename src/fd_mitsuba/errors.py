@@ -10,6 +10,9 @@ _HIDDEN = re.compile(
     "\u2028\u2029\ufeff\ud800-\udfff]"  # line separators, byte order mark, halves of characters
 )
 
+_NO_MEMORY = ("allocate memory", "out of memory", "bad_alloc", "bad alloc", "unable to allocate", "size calculation")
+"""What NumPy, torch, Dr.Jit and the system say when there is not enough."""
+
 
 class UserError(Exception):
     """Bad input: the message is one line that names the file, the element and what to do. Exit code 1."""
@@ -35,3 +38,15 @@ def first_line(error: BaseException) -> str:
 def printable(line: str) -> str:
     """A line for a terminal or a log, with what would not be seen but obeyed shown as `\\x1b`."""
     return _HIDDEN.sub(lambda match: match.group().encode("unicode_escape", "surrogatepass").decode(), line)
+
+
+def out_of_memory(error: BaseException) -> UserError | None:
+    """An allocation that failed, as one line; None for any other error."""
+    text = " ".join(str(error).split())
+    if not isinstance(error, MemoryError) and not any(words in text.lower() for words in _NO_MEMORY):
+        return None
+    about = f" ({text[:160]})" if text else ""
+    return UserError(
+        f"out of memory{about}; free some, or lower what is large: sizes of pictures and textures, samples, views, "
+        "geometry.grid_resolution, field.log2_table, the base's faces"
+    )

@@ -17,7 +17,7 @@ from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from test_evaluate import SETTINGS, Average
 
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import load_config
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.report.gallery import write_gallery
 from fd_mitsuba.evaluation.report.run_page import write_report
@@ -39,7 +39,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
     (root / "scene.xml").write_text("\n".join(pieces))
     (root / "tiny.toml").write_text(SETTINGS)
     run = root / "run"
-    config = load_config(root / "tiny.toml")
+    config = RunConfig.load(root / "tiny.toml")
     pipeline.run(load_edit_scene(root / "scene.xml"), config, run, quiet=True, say=lambda line: None)
     (root / "places.json").write_text('[{"position": [0, 1, 0]}]')
     write_report(run)

@@ -164,9 +164,9 @@ def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
     assert fine.active_vertices == pytest.approx(8 * default.active_vertices, rel=0.1)
     assert fine.seconds_per_step > default.seconds_per_step
     fixed = START_AND_EXPORT_SECONDS
-    assert short.seconds_total - fixed == pytest.approx((default.seconds_total - fixed) / 10)
+    assert short.seconds_total - fixed == pytest.approx((default.seconds_total - fixed) / 10, rel=1e-3)
     without = estimate_cost(scene, RunConfig(geometry=GeometryConfig(lambda_sds=0)))
-    assert without.seconds_per_step < 0.1 and without.memory_mb < default.memory_mb
+    assert without.seconds_per_step < 0.1 and without.geometry_memory_mb < default.geometry_memory_mb
     assert large.seconds_per_step > 10 * default.seconds_per_step and large.memory_mb > default.memory_mb + 3000
 
 
@@ -182,7 +182,7 @@ def test_cost_of_runs_that_were_measured(more: list[str], seconds: float, megaby
     scene = load_edit_scene(ROOT / "scenes" / "pegasus" / "scene.xml")
     cost = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", more))
     assert cost.seconds_per_step == pytest.approx(seconds, rel=0.3)
-    assert cost.memory_mb == pytest.approx(megabytes, rel=0.2)
+    assert cost.geometry_memory_mb == pytest.approx(megabytes, rel=0.2)
 
 
 def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
@@ -194,7 +194,7 @@ def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
     assert plain.appearance_seconds_per_step == pytest.approx(0.5, rel=0.2)
     short = estimate_cost(scene, RunConfig.load(None, ["appearance.lambda_sds=0", "appearance.steps=200"]))
     steps = [cost.appearance_seconds_total - LIT_PICTURES_SECONDS for cost in (short, plain)]
-    assert steps[0] == pytest.approx(steps[1] / 10)
+    assert steps[0] == pytest.approx(steps[1] / 10, rel=1e-3)
     deep = estimate_cost(scene, RunConfig.load(None, ["appearance.lambda_sds=0", "appearance.max_depth=6"]))
     assert deep.appearance_seconds_per_step > 2 * plain.appearance_seconds_per_step
     lines = check_scene(scene, RunConfig()).lines()

@@ -74,11 +74,17 @@ def loads(page: Page) -> list[str]:
     return found
 
 
+def whole_glb() -> bytes:
+    text = b'{"asset": {"version": "2.0"}, "x": "' + b"y" * 200 + b'"}'
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("runs") / "cat")
     (run / "export").mkdir()
-    (run / "export" / "asset.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 268) + bytes(range(256)))
+    (run / "export" / "asset.glb").write_bytes(whole_glb())
     (run / "evaluation.json").write_text(json.dumps({"clip": {"judge": "tiny", "sim": 0.31, "dir_dot": 0.05}}))
     write_report(run)
     return run

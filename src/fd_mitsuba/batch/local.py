@@ -23,6 +23,8 @@ from fd_mitsuba.batch.record import write_record
 from fd_mitsuba.config import settings_for_run
 from fd_mitsuba.errors import UserError
 
+MOST_WORKERS, MOST_RETRIES = 1024, 100
+
 __all__ = ["Job", "Outcome", "is_finished", "job_matrix", "run_batch", "scene_name"]
 
 
@@ -95,6 +97,8 @@ def run_batch(
     """
     if workers < 1 or retries < 0:
         raise UserError(f"--workers {workers} --retries {retries}: give at least 1 worker and no negative number")
+    if workers > MOST_WORKERS or retries > MOST_RETRIES:
+        raise UserError(f"--workers {workers} --retries {retries}: give at most {MOST_WORKERS} and {MOST_RETRIES}")
     if len({job.folder.resolve() for job in jobs}) < len(jobs):
         raise UserError("two jobs of the batch have one folder; give each its own")
     for job in jobs:

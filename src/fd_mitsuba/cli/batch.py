@@ -39,11 +39,12 @@ def add_batch_commands(commands: argparse._SubParsersAction) -> None:
 def _batch(options: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from fd_mitsuba.backend.threads import most_threads
     from fd_mitsuba.batch.local import job_matrix, run_batch
     from fd_mitsuba.batch.record import print_table
 
-    if options.threads is not None and options.threads < 1:
-        raise UserError(f"-t {options.threads}: give a positive number")
+    if options.threads is not None and not 1 <= options.threads <= most_threads():
+        raise UserError(f"-t {options.threads}: give 1 to {most_threads()}")
     folder = Path(options.output)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; choose another -o folder")

@@ -29,7 +29,9 @@ from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
 from fd_mitsuba.cli.run import add_run_command
-from fd_mitsuba.errors import Interrupted, UserError
+from fd_mitsuba.errors import Interrupted, UserError, out_of_memory, printable
+
+_LONGEST_USAGE = 300
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -53,6 +55,12 @@ def main(arguments: list[str] | None = None) -> int:
         if verbose:
             raise
         remark(f"error: {error}")
+        return 1
+    except (MemoryError, RuntimeError) as error:
+        failure = out_of_memory(error)
+        if verbose or failure is None:
+            raise
+        remark(f"error: {failure}")
         return 1
     except KeyboardInterrupt:
         print(_interrupted(options), file=sys.stderr)
@@ -87,7 +95,9 @@ class _Parser(argparse.ArgumentParser):
     """Prints what is wrong in one line, without the usage text before it."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}; see {self.prog} --help\n")
+        words = printable(" ".join(message.split()))
+        words = words if len(words) <= _LONGEST_USAGE else f"{words[:_LONGEST_USAGE]}..."
+        self.exit(2, f"{self.prog}: error: {words}; see {self.prog} --help\n")
 
 
 def command_parser() -> argparse.ArgumentParser:

@@ -23,7 +23,7 @@ from fd_mitsuba.viewing.lit_views import some_cameras
 ELEVATION_DEG, RADIUS, FOV_DEG = 45.0, 3.4, 45.0
 BACKGROUND = 0.35
 """Linear grey behind lit and shaded objects, as in a run's own turntable."""
-_TOGETHER = 10
+VIEWS_TOGETHER = 10
 Kind = Literal["lit", "normals", "shaded"]
 
 
@@ -83,8 +83,8 @@ def lit_views(stage: AppearanceStage, count: int, size: int, spp: int) -> Judged
     solids = [scene.render_frame.to_user(np.asarray(mesh.vertices, np.float64)) for mesh in stage.parts.values()]
     cameras = judged_cameras(count, stage.aim)
     rows: dict[str, list[Tensor]] = {name: [] for name in ("edited", "base", "start", "base_pixels", "untouched")}
-    for first in range(0, count, _TOGETHER):
-        few = some_cameras(cameras, slice(first, first + _TOGETHER))
+    for first in range(0, count, VIEWS_TOGETHER):
+        few = some_cameras(cameras, slice(first, first + VIEWS_TOGETHER))
         edited, base, start = (which.trace(few, first, size=size, spp=spp) for which in (stage.rendering, alone, begun))
         split = edited if dual is stage.rendering else dual.trace(few, first, size=size, spp=spp)
         whole = (split.base_mask > 0.999) & (base.base_mask > 0.999)

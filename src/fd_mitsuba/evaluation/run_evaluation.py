@@ -15,7 +15,7 @@ from PIL import Image
 from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.boundary_step import boundary_step
-from fd_mitsuba.evaluation.judged_views import JudgedViews, lit_views, shape_views
+from fd_mitsuba.evaluation.judged_views import VIEWS_TOGETHER, JudgedViews, lit_views, shape_views
 from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
@@ -25,6 +25,7 @@ from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.io.json_object import read_json_object, write_json
 from fd_mitsuba.io.picture import write_picture
 from fd_mitsuba.runs.appearance_outcome import finished_appearance
+from fd_mitsuba.runs.cost_memory import refuse_too_many_samples
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -53,6 +54,13 @@ class Protocol:
     def __post_init__(self) -> None:
         if self.views < 1 or self.size < 16 or self.spp < 1:
             raise UserError(f"--views {self.views} --size {self.size} --spp {self.spp}: give at least 1, 16 and 1")
+        if self.views > 10_000 or self.size > 2048 or self.spp > 4096:
+            raise UserError(
+                f"--views {self.views} --size {self.size} --spp {self.spp}: give at most 10000, 2048 and 4096"
+            )
+        refuse_too_many_samples(
+            min(self.views, VIEWS_TOGETHER), self.size, self.spp, f"--size {self.size} --spp {self.spp}"
+        )
 
 
 def evaluate_run(

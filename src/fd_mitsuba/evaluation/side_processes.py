@@ -22,6 +22,7 @@ def evaluate_at_once(
         options: of the command `evaluate`, for all of them.
         program: the command line's first words.
     """
+    workers = min(workers, len(runs))
     threads = max(1, available_cores() // workers)
     processes = []
     try:

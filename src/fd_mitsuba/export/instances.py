@@ -28,6 +28,7 @@ from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instance_glb import instance_glb
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.glb import glb_content
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
@@ -68,8 +69,11 @@ def write_instances(run: Path, transforms: Path, name: str) -> list[Path]:
         made = {scene.with_name(name): instance_scene(exported, placements)}
     asset = folder / "asset.glb"
     if asset.is_file():
+        data = asset.read_bytes()
+        if glb_content(data) is None:
+            raise UserError(f"{asset}: is damaged (no whole GLB); run fd_mitsuba export {run} anew")
         with _whole(asset, run):
-            made[folder / Path(name).with_suffix(".glb")] = instance_glb(asset.read_bytes(), placements)
+            made[folder / Path(name).with_suffix(".glb")] = instance_glb(data, placements)
     for path, data in made.items():
         write_atomically(path, data)
     return list(made)

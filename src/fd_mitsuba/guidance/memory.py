@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,27 @@ def available_bytes(device: str = "cpu") -> int | None:
     """
     if torch.device(device).type == "cuda":
         return torch.cuda.mem_get_info(torch.device(device))[0]
-    amounts = [_meminfo_available() or _sysconf_available(), _cgroup_available()]
+    amounts = [_meminfo_available() or _sysconf_available(), _cgroup_available(), _limit_available()]
     known = [amount for amount in amounts if amount is not None]
     return min(known) if known else None
+
+
+def held_bytes() -> int:
+    """Bytes of memory that this process has now; 0 where the system does not say."""
+    return _own_pages(1)
+
+
+def _own_pages(which: int) -> int:
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[which]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _limit_available() -> int | None:
+    """What `ulimit -v` leaves."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else max(limit - _own_pages(0), 0)
 
 
 def _meminfo_available() -> int | None:

@@ -21,6 +21,7 @@ from fd_mitsuba.io.picture import write_picture
 from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
+from fd_mitsuba.runs.cost_memory import refuse_too_many_samples
 from fd_mitsuba.runs.geometry_outcome import with_prompt
 from fd_mitsuba.runs.preservation import measure_preservation
 from fd_mitsuba.runs.saved_run import saved_run
@@ -32,7 +33,7 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
 from fd_mitsuba.training.step_views import check_views
-from fd_mitsuba.viewing.lit_views import lit_ring, ring_cameras
+from fd_mitsuba.viewing.lit_views import VIEWS_AT_ONCE, lit_ring, ring_cameras
 from fd_mitsuba.viewing.sheets import map_rows
 from fd_mitsuba.viewing.turntable import write_sheet, write_video
 
@@ -212,8 +213,12 @@ def render_run(
     Raises:
         UserError: no run, no appearance checkpoint, a size or count out of range, and see `load_edit_scene`.
     """
+    given = f"--views {views} --size {size} --spp {spp} --depth {max_depth}"
     if views < 1 or size < 16 or spp < 1 or (max_depth < 2 and max_depth != -1):
-        raise UserError(f"--views {views} --size {size} --spp {spp} --depth {max_depth}: too small; raise it")
+        raise UserError(f"{given}: too small; raise it")
+    if views > 1000 or size > 4096 or spp > 65536 or max_depth > 1000:
+        raise UserError(f"{given}: too large; give at most 1000, 4096, 65536 and 1000")
+    refuse_too_many_samples(min(views, VIEWS_AT_ONCE), size, spp, given)
     if Path(name).name != name:
         raise UserError(f"--output {name}: give a name without folders; images go to {folder / 'renders'}")
     scene, config = saved_run(folder, changed, say)

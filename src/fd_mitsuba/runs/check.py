@@ -108,11 +108,12 @@ class CheckReport:
         cost = self.cost
         lines.append(
             f"cost     shape: about {_number(cost.seconds_per_step)} s a step, {_duration(cost.seconds_total)} in all, "
-            f"{cost.memory_mb / 1000:.1f} GB of memory; {cost.active_share:.1%} of the grid active"
+            f"{cost.geometry_memory_mb * 2**20 / 1e9:.1f} GB of memory; {cost.active_share:.1%} of the grid active"
         )
         if cost.appearance_seconds_total > 0:
             step, whole = _number(cost.appearance_seconds_per_step), _duration(cost.appearance_seconds_total)
-            lines.append(f"         material: about {step} s a step, {whole} in all")
+            peak = cost.memory_mb * 2**20 / 1e9
+            lines.append(f"         material: about {step} s a step, {whole} in all, {peak:.1f} GB of memory")
         lines += [f"         assumes {assumption}" for assumption in cost.assumptions]
         fine = [] if self.refusal is not None else ["ok       nothing to warn of"]
         lines += [f"warning  {warning}" for warning in self.warnings] or fine
@@ -155,6 +156,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
             + _base_warnings(base)
             + _region_warnings(regions, config)
             + _scene_warnings(scene, config)
+            + ([cost.memory_warning] if cost.memory_warning else [])
         ),
         prompt_reading=reading,
         refusal=refusal,

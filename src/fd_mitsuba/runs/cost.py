@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
 
@@ -18,8 +21,15 @@ START_AND_EXPORT_SECONDS = 15.0
 LIT_PICTURES_SECONDS = 45.0
 """What the appearance stage takes besides its steps: kernels, lit turntable, baked textures."""
 
-_OPERATIONS = 6e10
-"""Floating-point operations a second of two cores on the networks of Stable Diffusion."""
+_OPERATIONS = 3e10
+"""Floating-point operations a second of a core on the networks of Stable Diffusion."""
+_OPERATIONS_ELSEWHERE = 3e13
+"""The same of a graphics card, roughly: they differ by more than a factor of ten."""
+_MOST_CORES_OF_USE = 16
+
+_SECONDS_PER_MILLION_FACES = 20.0
+"""In each stage: search trees, signs of the grid, meshes to write."""
+_SECONDS_PER_MILLION_LIGHT_PIXELS = 0.5
 
 _REACH = 0.15
 """How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
@@ -33,23 +43,27 @@ class CostEstimate:
     active_share: float
     seconds_per_step: float
     seconds_total: float
-    memory_mb: float
+    geometry_memory_mb: float
     """These are of the geometry stage."""
     appearance_seconds_per_step: float
     appearance_seconds_total: float
     """0 where the stage is left out."""
+    memory_mb: float
+    """At the peak of the whole run, all stages and exports, in units of 2^20 bytes, to about 15 %."""
+    memory_warning: str
+    """What to say where this machine has hardly so much left; else nothing."""
     assumptions: tuple[str, ...]
 
 
 def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
-    """A rough forecast of a run's time and of the geometry stage's memory, by counting what a step touches.
+    """A rough forecast of a run's time, by counting what a step touches, and of its memory: see `cost_memory`.
 
         step = fixed + field (active vertices) + surface (faces) + rays + guidance (passes of the networks)
 
     averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
     them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores, no GPU:
-    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase, peaks of
-    1.1, 1.2 and 1.2 GB; importing, compiling and exporting took 15 s.
+    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase;
+    importing, compiling and exporting took 15 s.
     """
     geometry, guidance = config.geometry, config.guidance
     axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
@@ -62,36 +76,48 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     field = 3.5e-8 * config.field.levels * queries
     surface = 8e-7 * 8.6 * vertices ** (2 / 3)
     builtin = guidance.model == "builtin"
+    cores = min(cores_in_use(), _MOST_CORES_OF_USE)
     side = 32 if builtin else 64
     refined = 1 - geometry.coarse_fraction
     coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
     refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
-    weights, source = _unet_weights(guidance.model)
+    weights, source = unet_weights(guidance.model)
     passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
     if builtin:
-        forward, encoder = 0.1 / 4, 0.1 / 4  # four views are one picture to it
+        forward = encoder = 0.1 / 4 * 2 / cores  # four views are one picture to it; measured with two cores
     else:
         # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
-        forward, encoder = 800.0 * weights / _OPERATIONS, 2.2e12 / _OPERATIONS
+        rate = _OPERATIONS * cores if guidance.device == "cpu" else _OPERATIONS_ELSEWHERE
+        forward, encoder = 800.0 * weights / rate, 2.2e12 / rate
     image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
     step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
+    size = SceneSize.of(scene)
+    more_faces, more_light = size.faces / 1e6, size.light_pixels / 1e6
     assumptions = (
-        "2 cores of about 60 GFLOP/s together, otherwise idle, and views at the size of the latent",
+        f"{cores} cores of about 30 GFLOP/s each, otherwise idle, and views at the size of the latent",
+        *([] if guidance.device == "cpu" else [f"networks on {guidance.device}, at about 30 TFLOP/s"]),
+        f"a base of {size.faces} faces, light of {more_light:.3g} million pixels",
         f"a UNet of {weights / 1e6:.3g} million weights ({source})",
         f"{queries} queries of the part's field a step",
     )
-    memory = 850 + 5e-5 * vertices + 7e-5 * queries * config.field.levels
-    if geometry.lambda_sds > 0:
-        size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
-        memory += 100 + 1.2e-6 * weights * size
-        if not builtin:  # as `guidance.memory` will demand: one call of the UNet, and the encoder's maps for half of it
-            memory += 65 * size * guidance.views_per_call + 3300 * max(1, guidance.views_per_call // 2)
-    total = step * geometry.steps + START_AND_EXPORT_SECONDS
+    # The run leaves the appearance stage out where its prior knows no faces of a cut.
+    left_out = builtin and scene.subtracts and config.appearance.lambda_sds > 0
+    stages = ("geometry",) if left_out else ("geometry", "appearance")
+    shape_memory = sum(run_memory(size, config, ("geometry",), weights).values())
+    terms = run_memory(size, config, stages, weights)
+    try:
+        warning = memory_warning(scene, terms) or ""
+    except UserError as error:
+        warning = str(error)
+    total = step * geometry.steps + START_AND_EXPORT_SECONDS + _SECONDS_PER_MILLION_FACES * more_faces
     lit = _appearance_step(config, forward, encoder)
-    if builtin and scene.subtracts and config.appearance.lambda_sds > 0:  # the run leaves the stage out
-        return CostEstimate(active, share, step, total, memory, 0.0, 0.0, assumptions)
     lit_total = lit * config.appearance.steps + LIT_PICTURES_SECONDS
-    return CostEstimate(active, share, step, total, memory, lit, lit_total, assumptions)
+    lit_total += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
+    if left_out:
+        lit = lit_total = 0.0
+    return CostEstimate(
+        active, share, step, total, shape_memory, lit, lit_total, sum(terms.values()), warning, assumptions
+    )
 
 
 def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float:
@@ -116,7 +142,8 @@ def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float
     return 0.15 + light + (0.03 if settings.style else 0.0) + (image if guided else 0.0)
 
 
-def _unet_weights(model: str) -> tuple[float, str]:
+def unet_weights(model: str) -> tuple[float, str]:
+    """How many parameters the UNet of a guidance model has, and how that is known."""
     folder = Path(model) / "unet"
     files = list(folder.glob("*.safetensors")) or list(folder.glob("*.bin"))
     if files:

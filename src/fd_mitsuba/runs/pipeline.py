@@ -28,6 +28,8 @@ from fd_mitsuba.runs.appearance_outcome import (
     prepare_appearance,
     write_appearance,
 )
+from fd_mitsuba.runs.cost import unet_weights
+from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.runs.geometry_outcome import (
     cut_out,
     export_geometry,
@@ -137,6 +139,9 @@ def _run(
     with_geometry = "geometry" in stages and geometry_from is None
     for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
         say(line)
+    size, weights = SceneSize.of(scene), unet_weights(config.guidance.model)[0]
+    if warning := memory_warning(scene, run_memory(size, config, tuple(stages), weights)):
+        say(warning)
     # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
     for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None
     for_appearance = None

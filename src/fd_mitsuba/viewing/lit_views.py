@@ -15,7 +15,7 @@ from fd_mitsuba.render.tonemap import to_srgb
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.viewing.sheets import as_bytes
 
-_VIEWS_AT_ONCE = 4
+VIEWS_AT_ONCE = 4
 _ENOUGH = 32
 """Samples of a pixel that can be shared by four: fewer are better spread over one pixel by themselves."""
 _BACKGROUND = 0.35
@@ -51,8 +51,8 @@ def lit_ring(
         shade: a G-buffer and a seed -> linear pictures (b, 3, size, size), multiplied by coverage.
     """
     frames, finer = [], 2 if spp >= _ENOUGH else 1
-    for start in range(0, len(cameras), _VIEWS_AT_ONCE):
-        few = some_cameras(cameras, slice(start, start + _VIEWS_AT_ONCE))
+    for start in range(0, len(cameras), VIEWS_AT_ONCE):
+        few = some_cameras(cameras, slice(start, start + VIEWS_AT_ONCE))
         gbuffer = rendering.trace(few, seed + start, size=size * finer, spp=spp // finer**2)
         linear = shade(gbuffer, seed + start) * exposure + _BACKGROUND * (1 - gbuffer.alpha)
         frames.append(as_bytes(to_srgb(avg_pool2d(linear, finer))))

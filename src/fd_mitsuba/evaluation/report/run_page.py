@@ -19,6 +19,7 @@ from fd_mitsuba.evaluation.report.curves import stage_curves
 from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
 from fd_mitsuba.evaluation.report.run_record import RunRecord, changed_settings, read_run
 from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.io.glb import glb_content
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.runs.run_folder import TRIES_RECORD
 from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, read_picture, sheet_row, strip, video_frames
@@ -177,7 +178,7 @@ def _glb(folder: Path) -> tuple[str | None, str]:
             f"export/asset.glb ({path.stat().st_size >> 20} MB) is too large for this page; open the file itself.",
         )
     data = path.read_bytes()
-    if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
+    if glb_content(data) is None:
         return None, "export/asset.glb is damaged; export the run anew."
     if viewer_script() is None:
         return None, "This installation has no copy of model-viewer; open export/asset.glb in any viewer of glTF."

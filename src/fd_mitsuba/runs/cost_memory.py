@@ -1,0 +1,194 @@
+"""How much memory a run will take at its peak: what a run takes in any case, and what each input adds.
+
+The numbers are differences of measured peaks (resident set, 2 cores, `configs/quick.toml`, the cat): 1.63 GB as it is
+shipped; 3.54 GB with 2.0 million faces, 5.29 GB under a light of 8192 x 4096 pixels, 3.52 GB with textures of 4096 x
+4096, 4.31 GB with baked textures of that size, 1.82 GB on a grid of 128 cells a side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.sections import MOST_SAMPLES, FieldConfig, TextureConfig
+from fd_mitsuba.conventions import BASE_NAME
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.memory import available_bytes, held_bytes
+from fd_mitsuba.io.picture_size import picture_size
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.viewing.lit_views import VIEWS_AT_ONCE
+
+_MIB = 2.0**20
+_IMPORTS, _BUILTIN = 390.0, 200.0
+_SHAPE, _MATERIAL = 550.0, 490.0
+"""What the geometry stage with its exports, and then the appearance stage with its own, add in any case."""
+_PER_FACE = {"check": 830.0, "run": 990.0}
+_PER_LIGHT_PIXEL = {"check": 70.0, "run": 112.0}
+_PER_HELD_LIGHT_PIXEL = 41.0
+_PER_TEXTURE_VALUE = {"check": 3.0, "run": 29.0}
+_PER_GRID_VERTEX = 140.0
+_PER_TEXEL = 178.0
+_PER_TABLE_BYTE = 10.0
+"""A field's parameters, their gradients and moments, and the copies of a checkpoint."""
+_PER_SAMPLE = 59.0
+_USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, VIEWS_AT_ONCE * 256**2 * 12, 1024**2
+_TIGHT, _TOO_MUCH = 0.9, 1.25
+"""Shares of what is left from which a run is warned of, and refused: the forecast is right to about 15 %."""
+_WORTH_NAMING = 0.25
+_VIDEO_SPP = 12  # as `appearance` has it
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """What of a scene costs memory.
+
+    Attributes:
+        faces: of the base.
+        light_pixels: of all images that emitters show.
+        texture_values: pixels times channels of all other images.
+    """
+
+    faces: int
+    light_pixels: int = 0
+    texture_values: int = 0
+
+    @classmethod
+    def of(cls, scene: EditScene) -> SceneSize:
+        """Read from the heads of the scene's files; an image that does not say its size counts as none."""
+        file = scene.inputs().scene
+        lights, textures = {}, {}
+        for element in file.elements:
+            name = element.properties.get("filename")
+            if not isinstance(name, str) or element.plugin not in ("envmap", "bitmap"):
+                continue
+            path = file.resolve(name)
+            width, height = picture_size(path) or (0, 0)
+            if element.plugin == "envmap":
+                lights[path] = width * height
+            else:
+                textures[path] = width * height * _channels(path)
+        faces = sum(len(mesh.faces) for mesh in scene.base)
+        return cls(faces, sum(lights.values()), sum(textures.values()))
+
+
+def check_memory_mb(size: SceneSize) -> float:
+    """Peak of `fd_mitsuba check` in units of 2^20 bytes."""
+    return _IMPORTS + 20 + sum(_scene_terms(size, "check").values())
+
+
+def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet_weights: float) -> dict[str, float]:
+    """Setting or input -> what it adds to the peak of a run, in units of 2^20 bytes; "any run" is the rest.
+
+    Args:
+        stages: `geometry`, `appearance` or both.
+        unet_weights: parameters of the guidance model's UNet.
+    """
+    lit = "appearance" in stages
+    terms = {"any run": _IMPORTS + _SHAPE + (_MATERIAL if lit else 0.0)}
+    terms |= _scene_terms(size, "run" if lit else "check")
+    if not lit:  # a large light takes most while it is read, when the rest of the run is not there yet
+        light = size.light_pixels / _MIB
+        terms["light"] = max(_PER_HELD_LIGHT_PIXEL * light, terms["light"] - _SHAPE)
+    grid = (config.geometry.grid_resolution + 1) ** 3
+    terms["geometry.grid_resolution"] = _PER_GRID_VERTEX * (grid - _USUAL_GRID) / _MIB
+    terms["field.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.field) / _MIB
+    terms["guidance.model"] = _guidance(config, stages, unet_weights)
+    if lit:
+        settings, output = config.appearance, config.output
+        side = settings.picture_size or (32 if config.guidance.model == "builtin" else 512)
+        step = settings.views * side**2 * settings.spp
+        turn = VIEWS_AT_ONCE * output.turntable_size**2 * _VIDEO_SPP
+        name = "output.turntable_size" if turn >= step else "appearance.spp"
+        terms[name] = _PER_SAMPLE * (max(turn, step) - _USUAL_SAMPLES) / _MIB
+        terms["output.texture_size"] = _PER_TEXEL * (output.texture_size**2 - _USUAL_TEXELS) / _MIB
+        terms["texture.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.texture) / _MIB
+    return terms
+
+
+def memory_warning(scene: EditScene, terms: dict[str, float]) -> str | None:
+    """What to say where a run of `run_memory`'s terms will hardly fit into what this machine has left.
+
+    Raises:
+        UserError: it will not fit.
+    """
+    needed, left = sum(terms.values()) * _MIB - held_bytes(), available_bytes()
+    if left is None or needed <= _TIGHT * left:
+        return None
+    largest = max((name for name in terms if name != "any run"), key=lambda name: terms[name])
+    share = terms[largest] * _MIB
+    text = (
+        f"{scene.path}: the run needs about {needed / 1e9:.1f} GB of memory at its peak, and {left / 1e9:.1f} GB are "
+        "left; free some"
+    )
+    if share > _WORTH_NAMING * needed:
+        cause, remedy = _CAUSES.get(largest, largest), _REMEDIES.get(largest, "lower it")
+        text += f", or {remedy}: {share / 1e9:.1f} GB are for {cause}"
+    if needed > _TOO_MUCH * left:
+        raise UserError(text)
+    return text
+
+
+def refuse_too_many_samples(pictures: int, size: int, spp: int, options: str) -> None:
+    """UserError where so many square pictures of so many samples a pixel cannot be rendered at once.
+
+    Args:
+        options: what the user gave, for the message.
+    """
+    samples = pictures * size**2 * spp
+    needed, left = _PER_SAMPLE * samples, available_bytes()
+    if samples > MOST_SAMPLES or (left is not None and needed > _TOO_MUCH * left):
+        much = "more than Dr.Jit can number" if samples > MOST_SAMPLES else f"{needed / 1e9:.1f} GB of memory"
+        raise UserError(f"{options}: {pictures} pictures at once are {samples} samples, {much}; lower size or samples")
+
+
+_CAUSES = {"faces": f"the faces of the {BASE_NAME}", "light": "the light's image", "textures": "the scene's textures"}
+_REMEDIES = {
+    "faces": "take a mesh with fewer",
+    "light": "take a smaller one",
+    "textures": "take smaller ones",
+    "guidance.model": "lower guidance.views_per_call or take a smaller model",
+}
+
+
+def _scene_terms(size: SceneSize, command: str) -> dict[str, float]:
+    return {
+        "faces": _PER_FACE[command] * size.faces / _MIB,
+        "light": _PER_LIGHT_PIXEL[command] * size.light_pixels / _MIB,
+        "textures": _PER_TEXTURE_VALUE[command] * size.texture_values / _MIB,
+    }
+
+
+def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float) -> float:
+    guidance = config.guidance
+    wanted = [config.geometry.lambda_sds > 0] * ("geometry" in stages)
+    wanted += [config.appearance.lambda_sds > 0] * ("appearance" in stages)
+    if not any(wanted):
+        return 0.0
+    if guidance.model == "builtin":
+        return _BUILTIN
+    size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
+    text = 4 * 123e6  # the text encoder stays on the CPU, and so does its float32
+    if guidance.device != "cpu":
+        return (text + weights * size) / _MIB  # loaded here before it is moved
+    # As `guidance.memory` demands: weights with the VAE, one call of the UNet, the encoder's maps for half of it.
+    calls = 65e6 * size * guidance.views_per_call + 3300e6 * max(1, guidance.views_per_call // 2)
+    return (text + weights * size + 4 * 84e6 + calls) / _MIB
+
+
+def _table_bytes(field: FieldConfig | TextureConfig) -> float:
+    """Bytes of a hash grid's parameters, levels that are smaller than the table counted as they are."""
+    levels, features, table = field.levels, field.features, 2**field.log2_table
+    growth = (field.finest_resolution / field.base_resolution) ** (1 / max(levels - 1, 1))
+    sides = (field.base_resolution * growth**level for level in range(levels))
+    return sum(4.0 * features * min(table, (side + 1) ** 3) for side in sides)
+
+
+def _channels(path: Path) -> int:
+    try:
+        with Image.open(path) as image:
+            return len(image.getbands())
+    except Exception:  # formats that Pillow does not read, such as EXR
+        return 3
