@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -126,8 +127,35 @@ def test_shape_first_and_material_later(place: Path, capfd: pytest.CaptureFixtur
     assert not (place / "parts" / "images" / "appearance.png").exists()
     assert main(["render", str(place / "parts")]) == 1
     assert "appearance stage has not begun" in capfd.readouterr().err
-    assert run(place, "parts", "--stage", "appearance") == 0
+    # The material's own settings may be other ones now; they are those of the run from then on.
+    assert run(place, "parts", "--stage", "appearance", "--set", "appearance.steps=4") == 0
     assert len(list_checkpoints(place / "parts" / "checkpoints_appearance")) == 2
+    assert json.loads((place / "parts" / "config.json").read_text())["appearance"]["steps"] == 4
+    assert main(["export", str(place / "parts"), "--format", "ply", "--texture-size", "16"]) == 0
+    capfd.readouterr()
+    before = (place / "parts" / "config.json").read_bytes()
+    assert run(place, "parts", "--resume", "--set", "appearance.steps=5") == 1
+    assert "appearance.steps = 4, now 5" in capfd.readouterr().err
+    assert (place / "parts" / "config.json").read_bytes() == before  # nothing is written before it is refused
+
+
+def test_a_resume_takes_settings_that_change_no_result(
+    place: Path, finished: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(finished, place / "other_output")
+    settings = ("output.turntable_frames=3", "output.texture_size=64", "guidance.views_per_call=1")
+    capfd.readouterr()
+    assert run(place, "other_output", "--resume", *[word for item in settings for word in ("--set", item)]) == 0
+    error = capfd.readouterr().err
+    assert "guidance.views_per_call = 1 (was 4)" in error and "output.turntable_frames = 3 (was 2)" in error
+    assert len(imageio.imread(copy / "videos" / "appearance.mp4")) == 3
+    with Image.open(copy / "export" / "textures" / "part_part_base_color.png") as picture:
+        assert picture.size == (64, 64)
+    name = "checkpoints_appearance/step_000003.safetensors"
+    assert (copy / name).read_bytes() == (finished / name).read_bytes()
+    # And on from there with the settings as they are now.
+    assert run(place, "other_output", "--resume", *[word for item in settings for word in ("--set", item)]) == 0
+    assert "goes on with" not in capfd.readouterr().err
 
 
 def test_another_light(place: Path, finished: Path) -> None:

@@ -253,6 +253,7 @@ def test_every_number_has_an_upper_bound() -> None:
         ("a" * 5000 + "=1", "unknown key"),
         ("appearance.spp=1000000000", "less than or equal to 4096"),
         ("appearance={spp=4096, views=64, picture_size=4096}", "at most 4294967295"),
+        ("geometry={views=64, silhouette_spp=4096}", "at most 4294967295"),
         ("output={turntable_size=4096, turntable_frames=1000}", "at most 1000000000"),
         ('guidance.model="a\\u0000b"', "guidance.model"),
         ("geometry.focal_sigma_sdf=1e-300", "greater than or equal to"),

@@ -129,6 +129,17 @@ class GeometryConfig(Section):
     normal_space: Literal["camera", "world"] = "camera"
     """Frame of the normals that are rendered."""
 
+    @model_validator(mode="after")
+    def _samples_can_be_numbered(self) -> GeometryConfig:
+        coarse, refined = 64**2 * (self.spp + self.silhouette_spp), 512**2 * (1 + self.silhouette_spp)
+        samples = self.views * (max(coarse, refined) if self.coarse_fraction < 1 else coarse)
+        if samples > MOST_SAMPLES:
+            raise ValueError(
+                f"geometry.views, spp and silhouette_spp make {samples} samples a step, at most {MOST_SAMPLES} are "
+                "possible"
+            )
+        return self
+
 
 class TextureConfig(Section):
     """The part's texture field: a hash grid and an MLP with one hidden layer (supplement "PBR Material")."""
