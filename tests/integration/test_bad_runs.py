@@ -83,7 +83,7 @@ OPTIONS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "negative weight": (["--set", "geometry.lambda_focal=-1"], ("geometry.lambda_focal", "change the value")),
     "NaN weight": (["--set", "geometry.lambda_focal=nan"], ("geometry.lambda_focal",)),
     "missing config": (["-c", "none.toml"], ("none.toml", "no such config file")),
-    "config that is a folder": (["-c", "/"], ("/", "cannot be read")),
+    "config that is a folder": (["-c", "/"], ("/", "is a folder")),
     "unknown -D": (["-D", "promt=x"], ("promt", "scene.xml")),
     "-D without =": (["-D", "prompt"], ("-D prompt", "name=value")),
     "-D without a name": (["-D", "=x"], ("-D =x", "name=value")),

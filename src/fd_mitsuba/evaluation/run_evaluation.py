@@ -110,7 +110,7 @@ def evaluate_run(
         "format": FORMAT,
         "key": key,
         "run": str(folder),
-        "scene": (read_json_object(folder / "run.json") or {}).get("scene_name") or scene.path.resolve().parent.name,
+        "scene": _scene_name(folder, scene),
         "prompt": own.prompt,
         "base_prompt": own.base_prompt,
         "seed": config.seed,
@@ -151,6 +151,12 @@ def _is_whole(known: dict) -> bool:
         return texts and groups and "kind" in known["views"] and bool([c.value(known) for c in COLUMNS.values()])
     except (TypeError, ValueError, KeyError, AttributeError):
         return False
+
+
+def _scene_name(folder: Path, scene: EditScene) -> str:
+    """The name of the folder that the scene lay in when it was run; the run's own copy lies in one called `scene`."""
+    recorded = (read_json_object(folder / "run.json") or {}).get("scene_name")
+    return recorded if isinstance(recorded, str) and recorded else scene.path.resolve().parent.name
 
 
 def _shape_kind(judge: Judge) -> Literal["normals", "shaded"]:

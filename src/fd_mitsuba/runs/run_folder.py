@@ -118,10 +118,14 @@ def identity(scene: EditScene, config: RunConfig, folder: Path) -> dict:
 
     Paths are relative to the run folder: they hold on when both are moved together, and say less of the machine.
     """
-    digest = hashlib.sha256()
-    # By name and content, each once: in a copy, one file may have become two.
-    for name, data in dict.fromkeys((Path(file).name, Path(file).read_bytes()) for file in scene.files):
-        digest.update(f"{name} {len(data)}\n".encode() + data)
+    digest, known = hashlib.sha256(), set()
+    for file in scene.files:
+        name, data = Path(file).name, Path(file).read_bytes()
+        # By name and content, each once: in a copy, one file may have become two.
+        if (key := (name, hashlib.sha256(data).digest())) not in known:
+            known.add(key)
+            digest.update(f"{name} {len(data)}\n".encode())
+            digest.update(data)
     return {
         "scene": _relative(scene.path, folder),
         "scene_name": scene.path.resolve().parent.name,
