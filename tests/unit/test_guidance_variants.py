@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
@@ -25,6 +26,7 @@ from fd_mitsuba.guidance.model_conventions import ModelConventions
 from fd_mitsuba.guidance.prompts import TextEmbeddings
 from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, passes_of
 
+BUILT_IN = ("sds", "csd", "ism", "reconstruction")
 SIGMA = 0.5
 TEXT, FREE = 0.8, -0.3
 """Mean of the data with and without the prompt; with 8 channels the base's latents are added to both."""
@@ -86,9 +88,9 @@ def denoiser(kind: str = "epsilon", channels: int = 4) -> Denoiser:
     return made
 
 
-def how(variant: str, **changes: object) -> Distillation:
-    settings = Distillation(variant, "uniform", 1.0, 1.0, (0.0, 1.0))
-    return replace(settings, **changes)
+def how(variant: str, own: dict | None = None, **changes: object) -> Distillation:
+    made = VARIANTS.make(Choice.of(variant, own), "guidance.variant")
+    return replace(Distillation(made, "uniform", 1.0, 1.0, (0.0, 1.0)), **changes)
 
 
 def chunk(*timesteps: int, mask: Tensor | None = None, base: float | None = None, seed: int = 0) -> Chunk:
@@ -135,7 +137,7 @@ def test_one_step_of_reconstruction_goes_to_the_expected_latents() -> None:
     z_t = alpha.sqrt() * what.z + (1 - alpha).sqrt() * what.noise
     share = alpha.sqrt() * SIGMA**2 / (alpha * SIGMA**2 + 1 - alpha)
     expected = what.z - (TEXT + share * (z_t - alpha.sqrt() * TEXT))
-    torch.testing.assert_close(gradient("reconstruction", what, reconstruction_steps=1), expected)
+    torch.testing.assert_close(gradient("reconstruction", what, own={"steps": 1}), expected)
 
 
 def test_many_steps_of_reconstruction_follow_the_path() -> None:
@@ -143,7 +145,7 @@ def test_many_steps_of_reconstruction_follow_the_path() -> None:
     z_t = alpha.sqrt() * what.z + (1 - alpha).sqrt() * what.noise
     z_0 = along_the_path(z_t, TEXT, alpha, torch.ones_like(alpha))
     errors = [
-        (gradient("reconstruction", what, reconstruction_steps=steps) - (what.z - z_0)).abs().max()
+        (gradient("reconstruction", what, own={"steps": steps}) - (what.z - z_0)).abs().max()
         for steps in (1, 4, 50)
     ]
     assert errors[0] > 1.5 * errors[1] > 6 * errors[2] and errors[2] < 0.1 * (what.z - z_0).abs().max()
@@ -160,7 +162,7 @@ def test_ism_follows_the_path_and_compares_two_levels_of_it(scale: float) -> Non
     mean = FREE + scale * (TEXT - FREE)
     expected = noise_seen(z_t, end, mean) - e_s
     errors = [
-        (gradient("ism", what, guidance_scale=scale, ism_inversion_step=stride) - expected).abs().max()
+        (gradient("ism", what, guidance_scale=scale, own={"inversion_step": stride}) - expected).abs().max()
         for stride in (0.3, 0.02)
     ]
     assert errors[1] < 0.3 * errors[0] and errors[1] < 0.02 * expected.abs().max()
@@ -180,7 +182,7 @@ def test_ism_near_the_clean_end_needs_no_inversion() -> None:
     assert len(network.components.unet.seen) == 2, "one look at z_s = z_0, one at z_t"
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_neighbours_do_not_matter(variant: str) -> None:
     together = gradient(variant, chunk(60, 300, 950))
     whole = chunk(60, 300, 950)
@@ -197,7 +199,7 @@ def test_neighbours_do_not_matter(variant: str) -> None:
 
 
 @pytest.mark.parametrize("channels", [4, 8])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_what_the_network_predicts_does_not_matter(variant: str, channels: int) -> None:
     what = chunk(100, 700, base=0.4 if channels == 8 else None)
     first, *others = (
@@ -209,18 +211,19 @@ def test_what_the_network_predicts_does_not_matter(variant: str, channels: int) 
         torch.testing.assert_close(other, first, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_a_network_that_sees_the_base_means_it_in_both_passes(variant: str) -> None:
     """With the base's latents added to both means, z moved by the same gives the same gradient."""
     plain, seen = chunk(200, 600), chunk(200, 600, base=0.4)
     seen = replace(seen, z=seen.z + 0.4)
-    got = gradient(variant, seen, denoiser(channels=8), guidance_scale=3.0, reconstruction_steps=1)
-    expected = gradient(variant, plain, guidance_scale=3.0, reconstruction_steps=1)
+    own = {"steps": 1} if variant == "reconstruction" else None
+    got = gradient(variant, seen, denoiser(channels=8), guidance_scale=3.0, own=own)
+    expected = gradient(variant, plain, guidance_scale=3.0, own=own)
     # ISM leaves clean latents for a level with next to no noise: there the shift is 0.4 sqrt(alpha), not 0.4.
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_a_mask_keeps_noise_and_gradient_inside(variant: str) -> None:
     mask = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     mask[..., :2] = 1
@@ -244,7 +247,7 @@ def test_passes_of_the_network(variant: str, passes: int) -> None:
 
 
 def test_seed_decides() -> None:
-    for variant in VARIANTS:
+    for variant in BUILT_IN:
         first, again, other = (gradient(variant, chunk(300, 700, seed=seed)) for seed in (1, 1, 2))
         assert first.equal(again)
         assert first.allclose(other) == (variant == "csd")  # of normal data it sees no noise

@@ -19,7 +19,7 @@ def add_check_command(commands: argparse._SubParsersAction) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     config = chosen_settings(options)
-    scene = load(options)
+    scene = load(options, config=config)
     from fd_mitsuba.runs.check import check_scene
 
     report = check_scene(scene, config)

@@ -21,6 +21,7 @@ from fd_mitsuba.cli.check import add_check_command
 from fd_mitsuba.cli.doctor import add_doctor_command
 from fd_mitsuba.cli.evaluate import add_evaluate_commands
 from fd_mitsuba.cli.export import add_export_commands
+from fd_mitsuba.cli.names import add_names_command
 from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
@@ -99,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         add_report_commands,
         add_evaluate_commands,
         add_ablate_commands,
+        add_names_command,
         add_doctor_command,
         add_prior_commands,
     ):

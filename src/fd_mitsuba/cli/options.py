@@ -12,12 +12,25 @@ from fd_mitsuba.errors import UserError
 
 
 def machine_options(parser: argparse.ArgumentParser) -> None:
-    """-m, -t and -v."""
+    """-m, -t, --plugin and -v."""
     parser.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant")
     parser.add_argument(
         "-t", "--threads", type=int, default=0, metavar="N", help="threads; 0: all cores, 1: bit-reproducible"
     )
+    plugin_option(parser)
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and library warnings")
+
+
+def plugin_option(parser: argparse.ArgumentParser) -> None:
+    """--plugin."""
+    parser.add_argument(
+        "--plugin",
+        dest="plugins",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="import a module or .py file that you trust, which registers losses, formats and the like",
+    )
 
 
 def remark(line: str) -> None:
@@ -42,6 +55,9 @@ def start(options: argparse.Namespace) -> None:
     from fd_mitsuba.backend.threads import share_cores
 
     share_cores(options.threads, options.variant)
+    from fd_mitsuba.config.registry import load_plugins
+
+    load_plugins(options.plugins)
 
 
 def quiet_libraries(options: argparse.Namespace) -> None:

@@ -28,7 +28,7 @@ def add_run_command(commands: argparse._SubParsersAction) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     config = chosen_settings(options)
-    scene = load(options)
+    scene = load(options, config=config)
     from fd_mitsuba.api import STAGES, edit
 
     run = edit(

@@ -47,11 +47,20 @@ def chosen_settings(options: argparse.Namespace) -> RunConfig:
     chosen = settings_for_run(options.config, options.overrides)
     if chosen.remark:
         remark(chosen.remark)
-    return chosen.config
+    plugins = tuple(dict.fromkeys([*chosen.config.plugins, *options.plugins]))
+    return chosen.config.model_copy(update={"plugins": plugins})
 
 
-def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:
-    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `api.load_scene`."""
+def load(
+    options: argparse.Namespace,
+    on_misplaced: Callable[[UserError], None] | None = None,
+    config: RunConfig | None = None,
+) -> EditScene:
+    """The scene, with Mitsuba started as the options say; `on_misplaced` as in `api.load_scene`.
+
+    Args:
+        config: whose plugins are imported, besides those of the options.
+    """
     parameters = definitions(options)
     quiet_libraries(options)
     from fd_mitsuba.api import load_scene
@@ -64,4 +73,5 @@ def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] 
         threads=options.threads,
         variant=options.variant,
         on_misplaced=on_misplaced,
+        plugins=options.plugins if config is None else config.plugins,
     )

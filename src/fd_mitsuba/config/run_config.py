@@ -26,6 +26,8 @@ from fd_mitsuba.errors import UserError
 
 _WITHOUT_EFFECT = {"guidance": ("device",)}
 """Settings that change where the work is done and not what comes out."""
+_CHOICES = ("kind", "variant")
+"""The settings of `guidance` that name an entry of a registry."""
 _NEWER = {"geometry": {"lambda_tether": 0.0}}
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
@@ -34,6 +36,8 @@ class RunConfig(Section):
     """Everything that decides a run besides the scene."""
 
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+    plugins: tuple[str, ...] = ()
+    """Modules, or .py files, that are imported before a run, so that they register what the settings name."""
     field: FieldConfig = FieldConfig()
     geometry: GeometryConfig = GeometryConfig()
     texture: TextureConfig = TextureConfig()
@@ -85,7 +89,7 @@ class RunConfig(Section):
 
     def content_hash(self, stage: str = "geometry") -> str:
         """Sixteen hex digits that change with any setting that the stage depends on, its own and those before it."""
-        later = {"texture", "appearance"} if stage == "geometry" else set()
+        later = {"plugins"} | ({"texture", "appearance"} if stage == "geometry" else set())
         values = self.model_dump(mode="json", exclude=later)
         for section, names in _WITHOUT_EFFECT.items():
             for name in names:
@@ -96,3 +100,25 @@ class RunConfig(Section):
                     del values[section][name]
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def names_entries(self) -> bool:
+        """Whether anything is named besides the defaults, which only the registries can check."""
+        usual = GuidanceConfig()
+        named = any(getattr(self.guidance, name) != getattr(usual, name) for name in _CHOICES)
+        return named or bool(self.geometry.losses or self.appearance.losses)
+
+    def completed_by(self, other: RunConfig) -> RunConfig:
+        """These settings with the options that `other`'s choices of the same names have besides."""
+        guidance = {name: getattr(self.guidance, name).completed_by(getattr(other.guidance, name)) for name in _CHOICES}
+        changed: dict[str, Any] = {"guidance": self.guidance.model_copy(update=guidance)}
+        for stage in ("geometry", "appearance"):
+            section, theirs = getattr(self, stage), getattr(other, stage).losses
+            losses = {
+                name: loss.with_options(loss.choice(name).completed_by(theirs[name].choice(name)).options)
+                if name in theirs
+                else loss
+                for name, loss in section.losses.items()
+            }
+            changed[stage] = section.model_copy(update={"losses": losses})
+        return self.model_copy(update=changed)

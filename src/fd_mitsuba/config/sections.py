@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.conventions import TextureChannel
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -61,6 +62,8 @@ class GeometryConfig(Section):
     """Share of each region, outside the base, that it keeps filled."""
     lambda_tether: NonNegative = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
+    losses: dict[str, Weighted] = {}
+    """Losses of other modules by name, each with its `lambda` and its own settings; see docs/extending.md."""
     views: Count = 4
     spp: Count = 4
     silhouette_spp: Count = 1
@@ -130,6 +133,8 @@ class AppearanceConfig(Section):
     """The part's boundary is its surface within this distance of the base, canonical units."""
     lambda_bend: NonNegative = 0.0
     """Price on bends of the shading normal, so that they are detail and not a lean of the whole part to the light."""
+    losses: dict[str, Weighted] = {}
+    """As `geometry.losses`, on the texture field."""
     single_path: bool = False
     """The paper's ablation: one field for the whole object, the base included."""
 
@@ -145,16 +150,12 @@ class AppearanceConfig(Section):
 
 
 class GuidanceConfig(Section):
+    kind: Choice = Choice(kind="diffusion")
+    """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
     model: str = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
-    variant: Literal["sds", "csd", "ism", "reconstruction"] = "sds"
-    """What makes the gradient; `guidance.variants` has the formulas."""
-    reconstruction_steps: Annotated[int, Field(ge=1, le=50)] = 4
-    """DDIM steps from z_t to the clean latents, for `reconstruction`."""
-    ism_interval: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Distance between the two noise levels that `ism` compares, as a share of all timesteps."""
-    ism_inversion_step: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Stride of the DDIM inversion up to the lower of them; each stride is one pass of the network."""
+    variant: Choice = Choice(kind="sds")
+    """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
     guidance_scale: NonNegative = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: NonNegative = 1.0

@@ -57,6 +57,8 @@ def apply_override(data: dict[str, Any], item: str) -> str:
     *sections, name = [part.strip() for part in key.split(".")]
     target = data
     for section in sections:
+        if isinstance(target.get(section), str):  # the name of a choice, which may be followed by its options
+            target[section] = {"kind": target[section]}
         target = target.setdefault(section, {})
         if not isinstance(target, dict):
             raise UserError(f"--set {item}: {section!r} is a value, not a section")
@@ -84,7 +86,7 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model) if "." in key else list(model.model_fields)
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.4)
-        hint = f"nearest: {', '.join(near)}" if near else f"sections: {', '.join(model.model_fields)}"
+        hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(model.model_fields) or 'none'}"
         return f"unknown key {key!r}; {hint}"
     return f"{key + ': ' if key else ''}{problem['msg']} (given: {str(problem['input'])[:60]!r}); change the value"
 

@@ -11,6 +11,7 @@ import numpy as np
 from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -107,7 +108,12 @@ class CheckReport:
 
 
 def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
-    """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written."""
+    """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written.
+
+    Raises:
+        UserError: the settings name what is not registered, or give it wrong options.
+    """
+    config = checked_choices(config)
     base = tuple(
         BaseCheck(mesh.name, len(mesh.vertices), len(mesh.faces), mesh.volume(), topology(mesh.vertices, mesh.faces))
         for mesh in scene.base

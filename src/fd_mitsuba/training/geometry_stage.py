@@ -140,8 +140,8 @@ class GeometryStage:
             values.update(result.logs)
             self._watch_visibility(pictures)
         if samples is not None:
-            losses.update(self.field_losses(surface.sample_sdf, samples))
-        weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
+            losses.update(self.field_losses(surface.sample_sdf, samples, step))
+        weights = {"sds": geometry.lambda_sds, **self.field_losses.weights}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
         values["part_faces"] = float(surface.face_is_part.sum())

@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     EXPOSURE = 12
     BASE_MATERIAL = 13
     STYLE_JITTER = 14
+    LOSSES = 15
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:
