@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fd_mitsuba.config.choice import Choice
     from fd_mitsuba.errors import Interrupted, RunStopped, UserError
     from fd_mitsuba.export.formats import EXPORTERS, Exporter
+    from fd_mitsuba.guidance.interface import GuidanceResult
     from fd_mitsuba.guidance.sources import GUIDANCES
     from fd_mitsuba.guidance.variants import VARIANTS, Variant
     from fd_mitsuba.scene.region_shapes import REGION_SHAPES
@@ -30,6 +31,7 @@ __all__ = [
     "FieldLoss",
     "GEOMETRY_LOSSES",
     "GUIDANCES",
+    "GuidanceResult",
     "Interrupted",
     "REGION_SHAPES",
     "Run",
@@ -54,6 +56,7 @@ _PLACES = {
     "FieldLoss": ("fd_mitsuba.training.geometry_losses", "FieldLoss"),
     "GEOMETRY_LOSSES": ("fd_mitsuba.training.geometry_losses", "GEOMETRY_LOSSES"),
     "GUIDANCES": ("fd_mitsuba.guidance.sources", "GUIDANCES"),
+    "GuidanceResult": ("fd_mitsuba.guidance.interface", "GuidanceResult"),
     "Interrupted": ("fd_mitsuba.errors", "Interrupted"),
     "REGION_SHAPES": ("fd_mitsuba.scene.region_shapes", "REGION_SHAPES"),
     "Run": ("fd_mitsuba.runs.run", "Run"),

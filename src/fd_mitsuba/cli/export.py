@@ -91,9 +91,11 @@ def _render(options: argparse.Namespace) -> int:
 
 def _export(options: argparse.Namespace) -> int:
     start(options)
+    from fd_mitsuba.config.toml_reading import read_choice
     from fd_mitsuba.runs.pipeline import export_run
 
-    written = export_run(Path(options.run), options.formats, options.texture_size, remark, options.faces)
+    formats = [read_choice(item) for item in options.formats]
+    written = export_run(Path(options.run), formats, options.texture_size, remark, options.faces)
     if options.json:
         print(json.dumps(written, indent=2))
         return 0

@@ -112,8 +112,8 @@ class Registry(Generic[T]):
             near = difflib.get_close_matches(name, self.names(), n=3, cutoff=0.4)
             hint = f"nearest: {', '.join(near)}; " if near else ""
             raise UserError(
-                f"{where}: unknown {self.label} {name!r}; {hint}known: {', '.join(self.names())}; one of your own needs "
-                "--plugin MODULE, or plugins in the settings"
+                f"{where}: unknown {self.label} {name!r}; {hint}known: {', '.join(self.names())}; one of your own "
+                "needs --plugin MODULE, or plugins in the settings"
             )
         return self._entries[name]
 

@@ -172,6 +172,11 @@ class GuidanceConfig(Section):
     """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
 
+    @property
+    def source(self) -> str:
+        """What guides, for messages and records: the model, or the name of another module's guidance."""
+        return self.model if self.kind.kind == "diffusion" else self.kind.kind
+
 
 class CamerasConfig(Section):
     radius: Positive = 3.0

@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 
 PRESETS_FOLDER = Path(__file__).with_name("presets")
@@ -64,6 +65,20 @@ def apply_override(data: dict[str, Any], item: str) -> str:
             raise UserError(f"--set {item}: {section!r} is a value, not a section")
     target[name] = value
     return ".".join([*sections, name])
+
+
+def read_choice(text: str) -> Choice:
+    """A choice as words of the command line: `stl`, or with options `stl {scale = 1000}`.
+
+    Raises:
+        UserError: the options are no TOML table.
+    """
+    name, brace, options = text.partition("{")
+    try:
+        own = tomllib.loads(f"own = {brace}{options}")["own"] if brace else {}
+    except tomllib.TOMLDecodeError:
+        raise UserError(f"{text}: write NAME, or 'NAME {{key = value}}'") from None
+    return Choice.of(name.strip(), own)
 
 
 def guilty_override(error: ValidationError, items: dict[str, str]) -> str | None:

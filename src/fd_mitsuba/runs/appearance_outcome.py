@@ -140,7 +140,7 @@ def _own_guidance(config: RunConfig, shared: Guidance | None, given: Guidance | 
     """A caller's guidance or another module's, where it can guide the appearance."""
     found: Any = given
     if given is None and config.guidance.kind.kind != "diffusion":
-        found = shared or load_guidance(config)
+        found = load_guidance(config) if shared is None else shared
     return found if hasattr(found, "guide_appearance") else None
 
 

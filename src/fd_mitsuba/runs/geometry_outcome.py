@@ -50,7 +50,7 @@ def prepare_geometry(
     """
     if config.geometry.lambda_sds == 0:
         return None
-    guidance = given or load_guidance(config)
+    guidance = load_guidance(config) if given is None else given
     if given is not None or not isinstance(guidance, DiffusionGuidance):
         return with_prompt(guidance, scene, say)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
@@ -137,7 +137,7 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
         "prompt": scene.prompt,
         "seed": config.seed,
         "steps": config.geometry.steps,
-        "guidance_model": config.guidance.model,
+        "guidance_model": config.guidance.source,
         **asdict(locality),
         "base_identical": identical,
         "part_faces": {name: len(solid.faces) for name, solid in parts.items()},

@@ -115,8 +115,6 @@ def run(
         metrics = export_geometry(geometry, folder)
     if guidance is not None:
         metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
-    elif not diffusion:
-        metrics["guidance_model"] = config.guidance.kind.kind
 
     def write_metrics() -> None:
         metrics["seconds"] = round(time.monotonic() - started, 1)

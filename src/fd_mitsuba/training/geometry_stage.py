@@ -54,7 +54,7 @@ class GeometryStage:
         trained_in = guidance.normal_space if guidance is not None else None
         if trained_in not in (None, geometry.normal_space):
             raise UserError(
-                f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.model} was trained with normals "
+                f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.source} was trained with normals "
                 f"in {trained_in} space; set geometry.normal_space={trained_in}"
             )
         check_views(self.name, config, guidance)
