@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from fd_mitsuba.batch.local import job_matrix, run_batch
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config.registry import load_plugins
 from fd_mitsuba.runs.choices import REGISTRIES
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.plugins import region_choice
 from fd_mitsuba.scene.scene_file import file_threads
 
@@ -62,16 +65,38 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def mine(place: Path) -> Iterator[str]:
-    """The module, imported; its entries go again, so that other tests see the package as it is."""
+@contextmanager
+def registered(place: Path) -> Iterator[None]:
+    """The module is imported; then its entries go again, so that other tests see the package as it is."""
     before = [dict(registry._entries) for registry in REGISTRIES]
     load_plugins([str(place / "mine.py")])
-    yield str(place / "mine.py")
+    yield
     for registry, entries in zip(REGISTRIES, before, strict=True):
         registry._entries = entries
     for name in [name for name in sys.modules if name.startswith("fd_mitsuba_plugin_") and name.endswith("_mine")]:
         del sys.modules[name]
+
+
+@pytest.fixture
+def mine(place: Path) -> Iterator[None]:
+    with registered(place):
+        yield
+
+
+@pytest.fixture(scope="module")
+def edited(place: Path) -> tuple[fd.Run, EditScene]:
+    with registered(place):
+        scene = fd.load_scene(place / "cat" / "scene.xml")
+        settings = fd.Config.load("smoke", [*TINY, *CHOSEN])
+        return fd.edit(scene, settings, output=place / "python", quiet=True), scene
+
+
+def command(*words: str) -> str:
+    """What a command prints, in a process of its own."""
+    program = [sys.executable, "-m", "fd_mitsuba", *words]
+    result = subprocess.run(program, capture_output=True, text=True, timeout=280)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def rows(folder: Path) -> list[dict]:
@@ -92,7 +117,7 @@ def check_run(folder: Path) -> None:
     assert json.loads((folder / "metrics.json").read_text())["guidance_model"] == "silhouette"
 
 
-def test_there_is_one_example_of_each_kind_in_about_twenty_lines(mine: str) -> None:
+def test_there_is_one_example_of_each_kind_in_about_twenty_lines(mine: None) -> None:
     assert {registry.kind: NAMES[registry.kind] in registry.names() for registry in REGISTRIES} == dict.fromkeys(
         NAMES, True
     )
@@ -102,38 +127,36 @@ def test_there_is_one_example_of_each_kind_in_about_twenty_lines(mine: str) -> N
         assert f"fd.{registry.kind.upper()}" in PAGE and f"`{registry.kind}`" in PAGE
 
 
-def test_an_edit_from_python(mine: str, place: Path) -> None:
-    scene = fd.load_scene(place / "cat" / "scene.xml")
+def test_an_edit_from_python(edited: tuple[fd.Run, EditScene], mine: None) -> None:
+    run, scene = edited
     egg = scene.regions[0].mesh
     assert egg is not None
     upper, lower = egg.vertices[:, 1].max(), egg.vertices[:, 1].min()
     middle = scene.frame.to_canonical(np.array([[-12, 34.2, 55.5]]))[0][1]
     assert (upper - middle) / (middle - lower) == pytest.approx(1.8), "the region's shape, with its property"
-    run = fd.edit(scene, fd.Config.load("smoke", [*TINY, *CHOSEN]), output=place / "python", quiet=True)
     check_run(run.folder)
-    small, large = run.export(["stl"])[0], place / "python" / "export" / "stl" / "part_part.stl"
-    assert small == large
-    volume = trimesh.load_mesh(small).volume
+    (path,) = run.export(["stl"])
+    assert path == run.folder / "export" / "stl" / "part_part.stl"
+    volume = trimesh.load_mesh(path).volume
     run.export([fd.Choice.of("stl", {"scale": 10})])
-    assert trimesh.load_mesh(large).volume == pytest.approx(1000 * volume, rel=1e-4)
+    assert trimesh.load_mesh(path).volume == pytest.approx(1000 * volume, rel=1e-4)
     assert volume == pytest.approx(run.part().volume, rel=1e-4)
 
 
-def test_an_edit_from_the_command_line(
-    mine: str, place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_edit_from_the_command_line(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a process of its own, which finds the module by --plugin alone."""
     monkeypatch.chdir(place)
     words = ["run", "cat/scene.xml", "-c", "smoke", "--plugin", "mine.py", "-q", "-o", "words"]
-    assert main([*words, *[word for item in [*TINY, *CHOSEN] for word in ("--set", item)]]) == 0
+    spoken = command(*words, *[word for item in [*TINY, *CHOSEN] for word in ("--set", item)])
+    assert "words: part in export/" in spoken
     check_run(place / "words")
     assert json.loads((place / "words" / "config.json").read_text())["plugins"] == ["mine.py"]
-    capsys.readouterr()
-    assert main(["export", "words", "--plugin", "mine.py", "--format", "glb", "stl {scale = 2}"]) == 0
-    written = capsys.readouterr().out.split()
+    written = command("export", "words", "--plugin", "mine.py", "--format", "glb", "stl {scale = 2}").split()
     assert {Path(name).name for name in written} == {"asset.glb", "part_part.stl"}
+    assert "thin: Mean of max(sdf_part - depth, 0)" in command("names", "--plugin", "mine.py")
 
 
-def test_a_region_like_that_in_a_plain_render(mine: str, place: Path) -> None:
+def test_a_region_like_that_in_a_plain_render(mine: None, place: Path) -> None:
     """Mitsuba itself reads the scene: our plugin takes the shape's properties, so that none is unknown to it."""
     mi = fd.register()
     with file_threads():
@@ -142,7 +165,7 @@ def test_a_region_like_that_in_a_plain_render(mine: str, place: Path) -> None:
     assert region_choice({"shape": "egg", "point": 1.8, "part": "x"}) == fd.Choice.of("egg", {"point": 1.8})
 
 
-def test_a_blend_without_a_share_is_score_distillation(mine: str) -> None:
+def test_a_blend_without_a_share_is_score_distillation(mine: None) -> None:
     what = chunk(100, 700)
     got = denoiser().latent_gradient(what, how("blend", {"share": 0.0}, guidance_scale=7.5))[0]
     torch.testing.assert_close(got, denoiser().latent_gradient(what, how("sds", guidance_scale=7.5))[0])
@@ -152,13 +175,13 @@ def test_without_the_module_the_names_are_unknown_and_nothing_is_written(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, output = ROOT / "scenes" / "cat" / "scene.xml", place / "none"
-    for override, key in zip(
-        CHOSEN, ("kind", "variant", "geometry.losses.thin", "appearance.losses.grey"), strict=True
-    ):
-        for words in (["run", str(scene), "-o", str(output)], ["check", str(scene)]):
-            assert main([*words, "-c", "smoke", "--set", override]) == 1
-            error = capsys.readouterr().err.strip().splitlines()[-1]
-            assert error.startswith("fd_mitsuba: error: ") and f"{key}: unknown" in error and "--plugin" in error
+    keys = ("guidance.kind", "guidance.variant", "geometry.losses.thin", "appearance.losses.grey")
+    for override, key in zip(CHOSEN, keys, strict=True):
+        assert main(["run", str(scene), "-o", str(output), "-c", "smoke", "--set", override]) == 1
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert error.startswith(f"fd_mitsuba: error: {key}: unknown") and "--plugin" in error
+    assert main(["check", str(scene), "--set", CHOSEN[0]]) == 1
+    assert "guidance.kind: unknown guidance 'silhouette'; known: diffusion" in capsys.readouterr().err
     assert main(["check", str(place / "cat" / "scene.xml")]) == 1
     assert "unknown region shape 'egg'; known: ellipsoid, box, cylinder" in capsys.readouterr().err
     assert not output.exists()
@@ -172,13 +195,16 @@ def test_a_batch_checks_names_before_it_starts_anything(place: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_folder_imports_nothing(mine: str, place: Path, tmp_path: Path) -> None:
-    """Its settings name a module that would leave a trace; opening and exporting the run does not import it."""
-    folder = shutil.copytree(place / "python", tmp_path / "run")
+def test_a_run_folder_imports_nothing(edited: tuple[fd.Run, EditScene], tmp_path: Path) -> None:
+    """Its settings name a module that would leave a trace: an export does not import it, and says what it lacks."""
+    folder = shutil.copytree(edited[0].folder, tmp_path / "run")
     (tmp_path / "trace.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w').write('imported')")
     record = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(record | {"plugins": [str(tmp_path / "trace.py")]}))
-    fd.Run.open(folder).export(["ply"])
+    with pytest.raises(fd.UserError, match="unknown region shape 'egg'; .*--plugin MODULE"):
+        fd.Run.open(folder).export(["ply"])
+    with registered(edited[0].folder.parent):
+        fd.Run.open(folder).export(["ply"])
     assert not (tmp_path / "trace").exists()
     load_plugins([str(tmp_path / "trace.py")])
     assert (tmp_path / "trace").exists()
