@@ -135,10 +135,10 @@ def test_an_edit_from_python(edited: tuple[fd.Run, EditScene], mine: None) -> No
     middle = scene.frame.to_canonical(np.array([[-12, 34.2, 55.5]]))[0][1]
     assert (upper - middle) / (middle - lower) == pytest.approx(1.8), "the region's shape, with its property"
     check_run(run.folder)
-    (path,) = run.export(["stl"])
+    (path,) = run.export(["stl"], texture_size=16)
     assert path == run.folder / "export" / "stl" / "part_part.stl"
     volume = trimesh.load_mesh(path).volume
-    run.export([fd.Choice.of("stl", {"scale": 10})])
+    run.export([fd.Choice.of("stl", {"scale": 10})], texture_size=16)
     assert trimesh.load_mesh(path).volume == pytest.approx(1000 * volume, rel=1e-4)
     assert volume == pytest.approx(run.part().volume, rel=1e-4)
 
@@ -151,7 +151,9 @@ def test_an_edit_from_the_command_line(place: Path, monkeypatch: pytest.MonkeyPa
     assert "words: part in export/" in spoken
     check_run(place / "words")
     assert json.loads((place / "words" / "config.json").read_text())["plugins"] == ["mine.py"]
-    written = command("export", "words", "--plugin", "mine.py", "--format", "glb", "stl {scale = 2}").split()
+    written = command(
+        "export", "words", "--plugin", "mine.py", "--format", "glb", "stl {scale = 2}", "--texture-size", "16"
+    ).split()
     assert {Path(name).name for name in written} == {"asset.glb", "part_part.stl"}
     assert "thin: Mean of max(sdf_part - depth, 0)" in command("names", "--plugin", "mine.py")
 
@@ -198,13 +200,13 @@ def test_a_batch_checks_names_before_it_starts_anything(place: Path, tmp_path: P
 def test_a_run_folder_imports_nothing(edited: tuple[fd.Run, EditScene], tmp_path: Path) -> None:
     """Its settings name a module that would leave a trace: an export does not import it, and says what it lacks."""
     folder = shutil.copytree(edited[0].folder, tmp_path / "run")
-    (tmp_path / "trace.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w').write('imported')")
+    (tmp_path / "trace.py").write_text(f"import pathlib; pathlib.Path({str(tmp_path / 'trace')!r}).touch()")
     record = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(record | {"plugins": [str(tmp_path / "trace.py")]}))
     with pytest.raises(fd.UserError, match="unknown region shape 'egg'; .*--plugin MODULE"):
-        fd.Run.open(folder).export(["ply"])
+        fd.Run.open(folder).export(["ply"], texture_size=16)
     with registered(edited[0].folder.parent):
-        fd.Run.open(folder).export(["ply"])
+        fd.Run.open(folder).export(["ply"], texture_size=16)
     assert not (tmp_path / "trace").exists()
     load_plugins([str(tmp_path / "trace.py")])
     assert (tmp_path / "trace").exists()
