@@ -169,6 +169,18 @@ def test_a_box_as_region_has_the_boxs_distance(make_scene: Make) -> None:
     assert region.thickness == pytest.approx(2 * 0.1 * scene.frame.scale, rel=0.1)
 
 
+def test_a_bar_through_a_slab_touches_it(make_scene: Make) -> None:
+    """No corner of either lies in the other: only what is between the corners meets."""
+    slab = shape("cube", '<transform name="to_world"><scale x="1" y="0.1" z="1"/></transform>')
+    inner = '<scale x="0.1" y="0.5" z="0.1"/>'
+    region = f"""<shape type="focal_region" id="bar"><string name="shape" value="box"/>
+      <transform name="to_world">{inner}</transform></shape>"""
+    scene = load_edit_scene(make_scene(base=slab, region=region))
+    canonical = scene.base_canonical
+    distance = MeshDistance(canonical.vertices, canonical.faces)
+    assert gap_to_base(scene.regions[0], distance, canonical) == 0
+
+
 def test_a_cylinder_as_region_takes_its_property(make_scene: Make) -> None:
     volumes = {}
     for top in (1.0, 0.5):

@@ -33,7 +33,8 @@ def box(settings: NoSettings) -> Arrays:
     """The cube from -1 to 1, as Mitsuba's `cube`."""
     corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     sides = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-    return corners, np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    first = 4 * np.arange(6)[:, None]  # each side has corners of its own, so that its edges are sharp in a picture
+    return corners[sides.ravel()], np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
 
 
 class CylinderSettings(Section):
@@ -51,10 +52,12 @@ def cylinder(settings: CylinderSettings) -> Arrays:
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
     lower, upper = rim - [0, 0, 1], rim * settings.top + [0, 0, 1]
     a, b = np.arange(count), np.roll(np.arange(count), -1)
-    low, high = np.full(count, 2 * count), np.full(count, 2 * count + 1)
-    faces = [(a, b, b + count), (a, b + count, a + count), (low, b, a), (high, a + count, b + count)]
-    vertices = np.concatenate([lower, upper, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
-    return vertices, np.concatenate([np.stack(face, axis=1) for face in faces])
+    low, high = np.full(count, 4 * count), np.full(count, 4 * count + 1)
+    side = [(a, b, b + count), (a, b + count, a + count)]
+    a, b = a + 2 * count, b + 2 * count  # the ends have rims of their own, so that their edges are sharp in a picture
+    ends = [(low, b, a), (high, a + count, b + count)]
+    vertices = np.concatenate([lower, upper, lower, upper, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
+    return vertices, np.concatenate([np.stack(face, axis=1) for face in [*side, *ends]])
 
 
 def shape_arrays(choice: Choice) -> Arrays:
