@@ -9,15 +9,37 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fd_mitsuba.api import Run, demo_scene, edit, evaluate, load_scene
     from fd_mitsuba.config import RunConfig as Config
+    from fd_mitsuba.config import Section
+    from fd_mitsuba.config.choice import Choice
     from fd_mitsuba.errors import Interrupted, RunStopped, UserError
+    from fd_mitsuba.export.formats import EXPORTERS, Exporter
+    from fd_mitsuba.guidance.interface import GuidanceResult
+    from fd_mitsuba.guidance.sources import GUIDANCES
+    from fd_mitsuba.guidance.variants import VARIANTS, Variant
+    from fd_mitsuba.scene.region_shapes import REGION_SHAPES
+    from fd_mitsuba.training.appearance_losses import APPEARANCE_LOSSES, AppearanceLoss
+    from fd_mitsuba.training.geometry_losses import GEOMETRY_LOSSES, FieldLoss
 
 __version__ = "0.1.0"
 __all__ = [
+    "APPEARANCE_LOSSES",
+    "AppearanceLoss",
+    "Choice",
     "Config",
+    "EXPORTERS",
+    "Exporter",
+    "FieldLoss",
+    "GEOMETRY_LOSSES",
+    "GUIDANCES",
+    "GuidanceResult",
     "Interrupted",
+    "REGION_SHAPES",
     "Run",
     "RunStopped",
+    "Section",
     "UserError",
+    "VARIANTS",
+    "Variant",
     "__version__",
     "demo_scene",
     "edit",
@@ -26,11 +48,24 @@ __all__ = [
     "register",
 ]
 _PLACES = {
+    "APPEARANCE_LOSSES": ("fd_mitsuba.training.appearance_losses", "APPEARANCE_LOSSES"),
+    "AppearanceLoss": ("fd_mitsuba.training.appearance_losses", "AppearanceLoss"),
+    "Choice": ("fd_mitsuba.config.choice", "Choice"),
     "Config": ("fd_mitsuba.config", "RunConfig"),
+    "EXPORTERS": ("fd_mitsuba.export.formats", "EXPORTERS"),
+    "Exporter": ("fd_mitsuba.export.formats", "Exporter"),
+    "FieldLoss": ("fd_mitsuba.training.geometry_losses", "FieldLoss"),
+    "GEOMETRY_LOSSES": ("fd_mitsuba.training.geometry_losses", "GEOMETRY_LOSSES"),
+    "GUIDANCES": ("fd_mitsuba.guidance.sources", "GUIDANCES"),
+    "GuidanceResult": ("fd_mitsuba.guidance.interface", "GuidanceResult"),
     "Interrupted": ("fd_mitsuba.errors", "Interrupted"),
+    "REGION_SHAPES": ("fd_mitsuba.scene.region_shapes", "REGION_SHAPES"),
     "Run": ("fd_mitsuba.runs.run", "Run"),
     "RunStopped": ("fd_mitsuba.errors", "RunStopped"),
+    "Section": ("fd_mitsuba.config", "Section"),
     "UserError": ("fd_mitsuba.errors", "UserError"),
+    "VARIANTS": ("fd_mitsuba.guidance.variants", "VARIANTS"),
+    "Variant": ("fd_mitsuba.guidance.variants", "Variant"),
     "demo_scene": ("fd_mitsuba.api", "demo_scene"),
     "edit": ("fd_mitsuba.api", "edit"),
     "evaluate": ("fd_mitsuba.api", "evaluate"),

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
 from fd_mitsuba.config import ChosenSettings, RunConfig, misfits, settings_for_run
+from fd_mitsuba.config.registry import load_plugins
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run import Run
 
@@ -46,6 +47,7 @@ def load_scene(
     threads: int = 0,
     variant: str = DEFAULT_VARIANT,
     on_misplaced: Callable[[UserError], None] | None = None,
+    plugins: Collection[str] = (),
 ) -> EditScene:
     """Read a scene and start Mitsuba if it has not been started.
 
@@ -57,6 +59,7 @@ def load_scene(
         threads: cores to use; 0: all; 1: results that are the same bytes at every run. Import torch after this call.
         variant: Mitsuba's.
         on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
+        plugins: modules or .py files to import first, which register what the scene names; see docs/extending.md.
 
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
@@ -69,6 +72,7 @@ def load_scene(
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
     share_cores(threads, variant)
+    load_plugins(plugins)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
     return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced)
@@ -111,14 +115,15 @@ def edit(
     """
     if log is None:
         log = _nothing if quiet else _to_stderr
-    if isinstance(scene, (str, Path)):
-        scene = load_scene(scene)
     opening = []
     if config is None:
         config = settings_for_run(None)
     if isinstance(config, ChosenSettings):
         opening = [config.remark] if config.remark else []
         config = config.config
+    if isinstance(scene, (str, Path)):
+        scene = load_scene(scene, plugins=config.plugins)
+    load_plugins(config.plugins)
     unknown = set(stages) - set(STAGES)
     if unknown or not stages:
         raise UserError(f"stages = {sorted(stages)}: give any of {', '.join(STAGES)}")

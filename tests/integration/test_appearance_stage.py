@@ -121,7 +121,8 @@ def test_style_consistency_ties_the_part_to_the_base(scene: EditScene, lump: Sim
     for style in (False, True):
         stage = trained(scene, lump, style=style, lambda_sds=0.3, boundary_reach=0.08)
         if style:
-            places, colours = stage.style.boundary, stage.style.beside.base_color
+            boundary = stage.losses.built_in["style_boundary"]
+            places, colours = boundary.boundary, boundary.beside.base_color
         steps[style] = stage
     difference = {
         style: float((stage.field(places).base_color - colours).abs().mean().detach()) for style, stage in steps.items()

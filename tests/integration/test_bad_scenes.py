@@ -95,6 +95,26 @@ CASES: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
         {"region": region(NEAR, '<string name="prt" value="hat"/>')},
         ("wing", "prt", "correct its name"),
     ),
+    "unknown shape of a region": (
+        {"region": region(NEAR, '<string name="shape" value="bx"/>')},
+        ("wing", "unknown region shape 'bx'", "nearest: box"),
+    ),
+    "misspelt property of a region's shape": (
+        {"region": region(NEAR, '<string name="shape" value="cylinder"/><float name="tp" value="0.5"/>')},
+        ("wing", "no property 'tp'", "nearest: top", "correct its name"),
+    ),
+    "wrong property of a region's shape": (
+        {"region": region(NEAR, '<string name="shape" value="cylinder"/><float name="top" value="-1"/>')},
+        ("wing", "shape (cylinder): top", "greater than 0", "-1"),
+    ),
+    "a property of another shape": (
+        {"region": region(NEAR, '<string name="shape" value="box"/><float name="top" value="1"/>')},
+        ("wing", "no property 'top'", "correct its name"),
+    ),
+    "region with shape and file": (
+        {"region": region(NEAR, '<string name="shape" value="box"/><string name="filename" value="animal.ply"/>')},
+        ("wing", "has the shape 'box' and a filename", "keep one"),
+    ),
     "misspelt property of dual_path": (
         {"integrator": INTEGRATOR.replace("base_prompt", "base_promt")},
         ("dual_path", "base_promt"),

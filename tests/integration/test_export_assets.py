@@ -240,7 +240,7 @@ def test_textured_part_renders_as_the_field_says(make_scene: Make, tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"formats": ["fbx"]}, "--format fbx: unknown"),
+        ({"formats": ["fbx"]}, "--format: unknown format 'fbx'; known: glb, obj, ply, mitsuba"),
         ({"size": 3}, "--texture-size 3"),
     ],
 )

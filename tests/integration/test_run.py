@@ -403,7 +403,7 @@ def test_weight_zero_turns_the_work_off(
         raise AssertionError("work for a loss that does not count")
 
     for name in ("loss_focal", "loss_collision", "DiffusionGuidance.load"):
-        module = "fd_mitsuba.runs.geometry_outcome" if "." in name else "fd_mitsuba.training.field_losses"
+        module = "fd_mitsuba.guidance.sources" if "." in name else "fd_mitsuba.training.geometry_losses"
         monkeypatch.setattr(f"{module}.{name}", never)
     weights = ("lambda_sds=0", "lambda_focal=0", "lambda_collision=0", "lambda_volume=0.1")
     assert run_here(place, "off", *[word for weight in weights for word in ("--set", f"geometry.{weight}")]) == 0

@@ -176,7 +176,7 @@ def test_settings_cannot_be_changed() -> None:
         RunConfig().geometry.steps = 3  # type: ignore[misc]
 
 
-LATER = ["reconstruction_steps=9", "ism_interval=0.1", "ism_inversion_step=0.1", "timestep_annealing=sqrt"]
+LATER = ["variant=ism", 'variant={kind="ism", interval=0.1}', "kind=mine", "timestep_annealing=sqrt"]
 
 
 def test_later_settings_count_only_when_they_are_changed() -> None:
@@ -189,11 +189,10 @@ def test_later_settings_count_only_when_they_are_changed() -> None:
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("variant=isn", "'sds', 'csd', 'ism' or 'reconstruction'"),
+        ("variant=3", "guidance.variant"),
+        ("variant.interval=0.1", "no name to go with; add the key kind"),
+        ("model.interval=0.1", "guidance.model: Input should be a valid string"),
         ("timestep_annealing=cosine", "'none', 'linear' or 'sqrt'"),
-        ("reconstruction_steps=0", "reconstruction_steps"),
-        ("ism_interval=0", "ism_interval"),
-        ("ism_inversion_step=1.5", "ism_inversion_step"),
         ("device=gpu", "device"),
     ],
 )
@@ -224,6 +223,7 @@ def test_settings_that_may_change_on_the_way_are_marked_at_the_field() -> None:
     assert marked == {f"output.{name}" for name in OutputConfig.model_fields} | {
         "guidance.views_per_call",
         "guidance.device",
+        "plugins",
     }
     others = ["guidance.device=cuda:1", "guidance.views_per_call=1", *(f"{key}=17" for key in marked if "out" in key)]
     for stage in ("geometry", "appearance"):
@@ -283,3 +283,49 @@ def test_a_file_that_the_parser_cannot_take(tmp_path: Path, text: str, words: st
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     assert "named pipe" in refusal(tmp_path / "pipe.toml")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "plain"),
+    [
+        (["guidance.variant=csd"], "csd"),
+        (["guidance.variant={kind = 'csd'}"], "csd"),
+        (["guidance.variant=ism", "guidance.variant.interval=0.1"], {"kind": "ism", "interval": 0.1}),
+        (["guidance.variant={kind='ism', interval=0.1}", "guidance.variant=csd"], "csd"),
+        (
+            ["guidance.variant={kind='ism', interval=0.1}", "guidance.variant.kind=csd"],
+            {"kind": "csd", "interval": 0.1},
+        ),
+    ],
+)
+def test_a_choice_is_a_name_or_a_name_with_options(overrides: list[str], plain: object) -> None:
+    config = RunConfig.load(None, overrides)
+    assert config.model_dump(mode="json")["guidance"]["variant"] == plain
+    assert RunConfig.model_validate(config.model_dump(mode="json")) == config
+
+
+def test_losses_of_other_modules_have_a_weight_and_options() -> None:
+    config = RunConfig.load(None, ["geometry.losses.thin.lambda=0.5", "geometry.losses.thin.depth=2"])
+    assert config.model_dump(mode="json")["geometry"]["losses"] == {"thin": {"lambda": 0.5, "depth": 2}}
+    assert RunConfig.model_validate(config.model_dump(mode="json")) == config
+    assert config.content_hash() != RunConfig().content_hash()
+    assert "geometry.losses.thin.lambda: Field required" in refusal(None, "geometry.losses.thin.depth=2")
+    assert "geometry.losses.thin.lambda" in refusal(None, "geometry.losses.thin.lambda=-1")
+    assert "geometry.losses.thin" in refusal(None, "geometry.losses.thin=1")
+
+
+def test_settings_that_were_left_to_defaults_are_completed_by_a_record() -> None:
+    """So that a finished run, whose record has all options, is known by the settings that asked for it."""
+    asked = ["guidance.variant={kind='ism', interval=1}", "geometry.losses.thin.lambda=1"]
+    record = ["guidance.variant={kind='ism', interval=1.0, inversion_step=0.2}"]
+    record += ["geometry.losses.thin={lambda=1, depth=2}", "seed=5"]
+    before = RunConfig.load(None, record)
+    completed = RunConfig.load(None, asked).completed_by(before)
+    assert completed.guidance == before.guidance and completed.geometry == before.geometry and completed.seed == 0
+    other = RunConfig.load(None, ["guidance.variant={kind='ism', interval=0.5}", "geometry.losses.thin.lambda=2"])
+    assert other.completed_by(before).guidance == other.guidance
+    assert other.completed_by(before).geometry.losses["thin"].weight == 2
+
+
+def test_the_modules_to_import_do_not_change_the_result() -> None:
+    assert RunConfig.load(None, ["plugins=['a']"]).content_hash() == RunConfig().content_hash()

@@ -153,6 +153,45 @@ def test_several_regions_parts_and_mesh_regions(make_scene: Make, tmp_path: Path
     assert np.isclose(by_mesh.size, scene.regions[1].size, rtol=0.03)
 
 
+def test_a_box_as_region_has_the_boxs_distance(make_scene: Make) -> None:
+    """Turned and stretched: against the closed form in the box's own axes, inside positive."""
+    turn = '<scale x="0.1" y="0.3" z="0.2"/><rotate x="1" angle="30"/><translate x="0.05" y="0.4" z="0"/>'
+    inner = f'<string name="shape" value="box"/><transform name="to_world">{turn}</transform>'
+    scene = load_edit_scene(make_scene(region=f'<shape type="focal_region" id="wing">{inner}</shape>'))
+    (region,) = scene.regions
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    angle = np.deg2rad(30)
+    axes = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    away = np.abs((scene.frame.to_user(points) - [0.05, 0.4, 0]) @ axes) - [0.1, 0.3, 0.2]
+    outside = np.linalg.norm(away.clip(min=0), axis=1)
+    expected = scene.frame.scale * np.where(away.max(axis=1) < 0, -away.max(axis=1), -outside)
+    assert (expected > 0).any() and np.allclose(region.sdf(points), expected, atol=1e-6)
+    assert region.volume == pytest.approx(8 * 0.1 * 0.3 * 0.2 * scene.frame.scale**3)
+    assert region.thickness == pytest.approx(2 * 0.1 * scene.frame.scale, rel=0.1)
+
+
+def test_a_bar_through_a_slab_touches_it(make_scene: Make) -> None:
+    """No corner of either lies in the other: only what is between the corners meets."""
+    slab = shape("cube", '<transform name="to_world"><scale x="1" y="0.1" z="1"/></transform>')
+    inner = '<scale x="0.1" y="0.5" z="0.1"/>'
+    region = f"""<shape type="focal_region" id="bar"><string name="shape" value="box"/>
+      <transform name="to_world">{inner}</transform></shape>"""
+    scene = load_edit_scene(make_scene(base=slab, region=region))
+    canonical = scene.base_canonical
+    distance = MeshDistance(canonical.vertices, canonical.faces)
+    assert gap_to_base(scene.regions[0], distance, canonical) == 0
+
+
+def test_a_cylinder_as_region_takes_its_property(make_scene: Make) -> None:
+    volumes = {}
+    for top in (1.0, 0.5):
+        inner = f'<string name="shape" value="cylinder"/><float name="top" value="{top}"/>{move("0.2", (0, 0.4, 0))}'
+        scene = load_edit_scene(make_scene(region=f'<shape type="focal_region" id="wing">{inner}</shape>'))
+        volumes[top] = scene.regions[0].volume / scene.frame.scale**3
+    assert volumes[1.0] == pytest.approx(2 * np.pi * 0.2**3, rel=1e-3)
+    assert volumes[0.5] / volumes[1.0] == pytest.approx((1 + 0.5 + 0.25) / 3), "a truncated cone"
+
+
 def test_parameters_fill_names_and_dollars_are_literal(make_scene: Make) -> None:
     integrator = '<integrator type="dual_path"><string name="prompt" value="$prompt"/></integrator>'
     extra = '<default name="prompt" value="a pig"/><default name="size" value="0.2"/>'

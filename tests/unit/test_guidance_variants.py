@@ -1,108 +1,23 @@
-"""Every variant against closed forms: networks that are perfect for normally distributed data.
-
-For z ~ N(m, sigma^2) the noisy latents are normal too, with variance v = alpha sigma^2 + 1 - alpha, so that the noise
-that a perfect network sees is e(z_t) = sqrt(1 - alpha) (z_t - sqrt(alpha) m) / v, and the paths of DDIM with endless
-many steps keep (z_t - sqrt(alpha) m) / sqrt(v).
-"""
+"""Every variant against closed forms: networks that are perfect for normally distributed data (`normal_data`)."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from normal_data import FREE, SIGMA, TEXT, along_the_path, chunk, denoiser, how, level, noise_seen
 from torch import Tensor
 
-from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
-from fd_mitsuba.guidance.loading import Components
-from fd_mitsuba.guidance.model_conventions import ModelConventions
 from fd_mitsuba.guidance.prompts import TextEmbeddings
-from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, passes_of
+from fd_mitsuba.guidance.variants import Chunk, passes_of
 
-SIGMA = 0.5
-TEXT, FREE = 0.8, -0.3
-"""Mean of the data with and without the prompt; with 8 channels the base's latents are added to both."""
-ALPHA_BARS = torch.linspace(0.9999**0.5, 0.07, 1000, dtype=torch.float64) ** 2
-
-
-class Settings(dict):
-    """A component's config as diffusers has it: a mapping whose keys are attributes too."""
-
-    __getattr__ = dict.__getitem__
-
-
-class NormalData(torch.nn.Module):
-    """A UNet that is perfect for normal data; the first number of the text states is the mean."""
-
-    dtype = torch.float64
-
-    def __init__(self, kind: str, channels: int) -> None:
-        super().__init__()
-        self.kind, self.config = kind, Settings(in_channels=channels, sample_size=4)
-        self.seen: list[Tensor] = []
-
-    def forward(self, inputs: Tensor, t: Tensor, encoder_hidden_states: Tensor, return_dict: bool) -> tuple[Tensor]:
-        z_t, alpha = inputs[:, :4].double(), ALPHA_BARS[t].view(-1, 1, 1, 1)
-        self.seen.append(z_t)
-        mean = encoder_hidden_states[:, 0, 0].double().view(-1, 1, 1, 1) + inputs[:, 4:].sum(1, keepdim=True)
-        noise = noise_seen(z_t, alpha, mean)
-        z = (z_t - (1 - alpha).sqrt() * noise) / alpha.sqrt()
-        v = alpha.sqrt() * noise - (1 - alpha).sqrt() * z
-        return (ExactDouble({"epsilon": noise, "v_prediction": v, "sample": z}[self.kind]),)
-
-
-class ExactDouble(torch.Tensor):
-    """A double tensor that stays one when the denoiser asks for single precision, so that closed forms can be exact."""
-
-    @staticmethod
-    def __new__(cls, values: Tensor) -> ExactDouble:
-        return values.as_subclass(cls)
-
-    def float(self) -> Tensor:  # type: ignore[override]
-        return self.as_subclass(torch.Tensor)
-
-
-def noise_seen(z_t: Tensor, alpha: Tensor, mean: Tensor | float) -> Tensor:
-    return (1 - alpha).sqrt() * (z_t - alpha.sqrt() * mean) / (alpha * SIGMA**2 + 1 - alpha)
-
-
-def along_the_path(z: Tensor, mean: float, start: Tensor, end: Tensor) -> Tensor:
-    """Where endless many DDIM steps lead from level `start` to level `end`."""
-    spread = [(alpha * SIGMA**2 + 1 - alpha).sqrt() for alpha in (start, end)]
-    return end.sqrt() * mean + spread[1] * (z - start.sqrt() * mean) / spread[0]
-
-
-def denoiser(kind: str = "epsilon", channels: int = 4) -> Denoiser:
-    scheduler = SimpleNamespace(alphas_cumprod=ALPHA_BARS, config={"prediction_type": kind})
-    parts = Components(None, None, NormalData(kind, channels), None, scheduler, ModelConventions(), Path("normal"))
-    made = Denoiser(parts, GuidanceConfig(views_per_call=8))
-    made.alpha_bars = ALPHA_BARS
-    return made
-
-
-def how(variant: str, **changes: object) -> Distillation:
-    settings = Distillation(variant, "uniform", 1.0, 1.0, (0.0, 1.0))
-    return replace(settings, **changes)
-
-
-def chunk(*timesteps: int, mask: Tensor | None = None, base: float | None = None, seed: int = 0) -> Chunk:
-    count = len(timesteps)
-    generator = torch.Generator().manual_seed(seed)
-    z, noise = torch.randn(2, count, 4, 4, 4, generator=generator, dtype=torch.float64)
-    states = {"text": TEXT, "image": FREE, "plain": FREE}
-    texts = {name: torch.full((count, 2, 3), value, dtype=torch.float64) for name, value in states.items()}
-    condition = None if base is None else torch.full((count, 4, 4, 4), base / 4, dtype=torch.float64)
-    return Chunk(z, noise, torch.tensor(timesteps), texts, condition, mask)
-
-
-def level(*timesteps: int) -> Tensor:
-    return ALPHA_BARS[list(timesteps)].view(-1, 1, 1, 1)
+BUILT_IN = ("sds", "csd", "ism", "reconstruction")
 
 
 def gradient(variant: str, what: Chunk, network: Denoiser | None = None, **changes: object) -> Tensor:
@@ -135,7 +50,7 @@ def test_one_step_of_reconstruction_goes_to_the_expected_latents() -> None:
     z_t = alpha.sqrt() * what.z + (1 - alpha).sqrt() * what.noise
     share = alpha.sqrt() * SIGMA**2 / (alpha * SIGMA**2 + 1 - alpha)
     expected = what.z - (TEXT + share * (z_t - alpha.sqrt() * TEXT))
-    torch.testing.assert_close(gradient("reconstruction", what, reconstruction_steps=1), expected)
+    torch.testing.assert_close(gradient("reconstruction", what, own={"steps": 1}), expected)
 
 
 def test_many_steps_of_reconstruction_follow_the_path() -> None:
@@ -143,8 +58,7 @@ def test_many_steps_of_reconstruction_follow_the_path() -> None:
     z_t = alpha.sqrt() * what.z + (1 - alpha).sqrt() * what.noise
     z_0 = along_the_path(z_t, TEXT, alpha, torch.ones_like(alpha))
     errors = [
-        (gradient("reconstruction", what, reconstruction_steps=steps) - (what.z - z_0)).abs().max()
-        for steps in (1, 4, 50)
+        (gradient("reconstruction", what, own={"steps": steps}) - (what.z - z_0)).abs().max() for steps in (1, 4, 50)
     ]
     assert errors[0] > 1.5 * errors[1] > 6 * errors[2] and errors[2] < 0.1 * (what.z - z_0).abs().max()
 
@@ -160,7 +74,7 @@ def test_ism_follows_the_path_and_compares_two_levels_of_it(scale: float) -> Non
     mean = FREE + scale * (TEXT - FREE)
     expected = noise_seen(z_t, end, mean) - e_s
     errors = [
-        (gradient("ism", what, guidance_scale=scale, ism_inversion_step=stride) - expected).abs().max()
+        (gradient("ism", what, guidance_scale=scale, own={"inversion_step": stride}) - expected).abs().max()
         for stride in (0.3, 0.02)
     ]
     assert errors[1] < 0.3 * errors[0] and errors[1] < 0.02 * expected.abs().max()
@@ -180,7 +94,7 @@ def test_ism_near_the_clean_end_needs_no_inversion() -> None:
     assert len(network.components.unet.seen) == 2, "one look at z_s = z_0, one at z_t"
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_neighbours_do_not_matter(variant: str) -> None:
     together = gradient(variant, chunk(60, 300, 950))
     whole = chunk(60, 300, 950)
@@ -197,7 +111,7 @@ def test_neighbours_do_not_matter(variant: str) -> None:
 
 
 @pytest.mark.parametrize("channels", [4, 8])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_what_the_network_predicts_does_not_matter(variant: str, channels: int) -> None:
     what = chunk(100, 700, base=0.4 if channels == 8 else None)
     first, *others = (
@@ -209,18 +123,19 @@ def test_what_the_network_predicts_does_not_matter(variant: str, channels: int) 
         torch.testing.assert_close(other, first, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_a_network_that_sees_the_base_means_it_in_both_passes(variant: str) -> None:
     """With the base's latents added to both means, z moved by the same gives the same gradient."""
     plain, seen = chunk(200, 600), chunk(200, 600, base=0.4)
     seen = replace(seen, z=seen.z + 0.4)
-    got = gradient(variant, seen, denoiser(channels=8), guidance_scale=3.0, reconstruction_steps=1)
-    expected = gradient(variant, plain, guidance_scale=3.0, reconstruction_steps=1)
+    own = {"steps": 1} if variant == "reconstruction" else None
+    got = gradient(variant, seen, denoiser(channels=8), guidance_scale=3.0, own=own)
+    expected = gradient(variant, plain, guidance_scale=3.0, own=own)
     # ISM leaves clean latents for a level with next to no noise: there the shift is 0.4 sqrt(alpha), not 0.4.
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", BUILT_IN)
 def test_a_mask_keeps_noise_and_gradient_inside(variant: str) -> None:
     mask = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     mask[..., :2] = 1
@@ -244,7 +159,7 @@ def test_passes_of_the_network(variant: str, passes: int) -> None:
 
 
 def test_seed_decides() -> None:
-    for variant in VARIANTS:
+    for variant in BUILT_IN:
         first, again, other = (gradient(variant, chunk(300, 700, seed=seed)) for seed in (1, 1, 2))
         assert first.equal(again)
         assert first.allclose(other) == (variant == "csd")  # of normal data it sees no noise

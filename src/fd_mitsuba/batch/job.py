@@ -44,6 +44,8 @@ class Job:
     """Instead of the scene's."""
     geometry_from: Path | None = None
     """As for `--from`: a finished run whose shape is taken over."""
+    plugins: tuple[str, ...] = ()
+    """As for `--plugin`."""
 
     @property
     def name(self) -> str:
@@ -61,10 +63,7 @@ class Job:
 
     def words(self, threads: int) -> list[str]:
         """Arguments for the command line; goes on with a run that is there."""
-        words = ["run", str(self.scene.resolve())]
-        words += [] if self.config is None else ["-c", str(locate_settings(self.config).resolve())]
-        for item in (*self.overrides, f"seed={self.seed}"):
-            words += ["--set", item]
+        words = ["run", str(self.scene.resolve()), *self.settings_words()]
         for item in self.definitions:
             words += ["-D", item]
         words += [] if self.prompt is None else ["--prompt", self.prompt]
@@ -72,6 +71,15 @@ class Job:
         words += [] if self.geometry_from is None else ["--from", str(self.geometry_from.resolve())]
         words += ["-o", str(self.folder.resolve()), "-t", str(threads)]
         return words + (["--resume"] if (self.folder / "run.json").is_file() else [])
+
+    def settings_words(self) -> list[str]:
+        """Those of them that say the settings."""
+        words = [] if self.config is None else ["-c", str(locate_settings(self.config).resolve())]
+        for item in (*self.overrides, f"seed={self.seed}"):
+            words += ["--set", item]
+        for module in self.plugins:
+            words += ["--plugin", str(Path(module).resolve()) if module.endswith(".py") else module]
+        return words
 
 
 @dataclass(frozen=True)
@@ -121,7 +129,7 @@ def is_finished(job: Job) -> bool:
     parameters = dict(item.partition("=")[::2] for item in job.definitions)
     now = job.settings()
     return (
-        before.content_hash(stage) == now.content_hash(stage)
+        before.content_hash(stage) == now.completed_by(before).content_hash(stage)
         and before.output == now.output
         and known.get("parameters") == parameters
         and (job.prompt is None or known.get("prompt") == " ".join(job.prompt.split()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -41,6 +42,7 @@ def job_matrix(
     folder: Path,
     definitions: Sequence[str] = (),
     stage: str = "all",
+    plugins: Sequence[str] = (),
 ) -> list[Job]:
     """A job for each scene, settings file and seed, in `folder/<scene>-<config>-<seed>`.
 
@@ -48,6 +50,7 @@ def job_matrix(
         scenes: scene files, or folders with a `scene.xml`.
         configs: settings files; None: the defaults.
         seeds: None: the one in the settings.
+        plugins: as for `--plugin`.
 
     Raises:
         UserError: a file is missing or its settings are wrong, or two jobs would share a folder.
@@ -58,7 +61,7 @@ def job_matrix(
         if not scene.is_file():
             raise UserError(f"{scene}: no such scene; give a scene file or a folder with a scene.xml")
         for config in configs or [None]:
-            probe = Job(scene, config, 0, tuple(overrides), folder, tuple(definitions), stage)
+            probe = Job(scene, config, 0, tuple(overrides), folder, tuple(definitions), stage, plugins=tuple(plugins))
             for seed in seeds if seeds is not None else [_own_seed(probe)]:
                 name = f"{scene_name(scene)}-{'default' if config is None else config.stem}-{seed}"
                 if name in jobs:
@@ -101,8 +104,7 @@ def run_batch(
         raise UserError(f"--workers {workers} --retries {retries}: give at most {MOST_WORKERS} and {MOST_RETRIES}")
     if len({job.folder.resolve() for job in jobs}) < len(jobs):
         raise UserError("two jobs of the batch have one folder; give each its own")
-    for job in jobs:
-        job.settings()
+    _check_names(jobs, program)
     threads = threads or max(1, available_cores() // workers)
     outcomes: dict[Job, Outcome] = {}
 
@@ -124,6 +126,23 @@ def run_batch(
 
             run_with_ray(jobs, workers, threads, retries, ray_address, token, program, stops, done)
     return [outcomes[job] for job in jobs]
+
+
+def _check_names(jobs: Sequence[Job], program: tuple[str, ...]) -> None:
+    """UserError where settings cannot be read, or name what is not registered or give it wrong options.
+
+    Names are looked up by a process of its own, and only where there are any besides the defaults: it loads torch.
+    """
+    naming = {}
+    for job in jobs:
+        if job.settings().names_entries:
+            naming[job.config, job.overrides, job.plugins] = job
+    for job in naming.values():
+        command = [*program, "names", *job.settings_words(), "--json"]
+        result = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+        if result.returncode:
+            last = (result.stderr.strip().splitlines() or [f"{' '.join(command)} failed"])[-1]
+            raise UserError(last.removeprefix("fd_mitsuba: error: "))
 
 
 def _run_here(

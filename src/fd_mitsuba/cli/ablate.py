@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from fd_mitsuba.cli.evaluate import batch_options, judge_options
@@ -52,6 +52,7 @@ def _ablate(options: argparse.Namespace) -> int:
     jobs = ablation_jobs(
         scene, Path(options.config), options.seeds, rows, folder, options.overrides, options.definitions, options.stage
     )
+    jobs = tuple([replace(job, plugins=tuple(options.plugins)) for job in stage] for stage in jobs)
     for job in (*jobs[0], *jobs[1]):
         job.settings()
     beside = Path(options.scenes) if options.scenes else scene.resolve().parent.parent

@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from fd_mitsuba.cli.options import remark, say
+from fd_mitsuba.cli.options import plugin_option, remark, say
 from fd_mitsuba.errors import UserError
 
 
@@ -32,6 +32,7 @@ def add_batch_commands(commands: argparse._SubParsersAction) -> None:
         "--retries", type=int, default=1, metavar="N", help="for a run that a signal has ended; default: 1"
     )
     batch.add_argument("-t", "--threads", type=int, metavar="N", help="for a run; default: the cores, shared out")
+    plugin_option(batch)
     batch.add_argument("-v", "--verbose", action="store_true", help="tracebacks")
     batch.set_defaults(call=_batch)
 
@@ -56,6 +57,7 @@ def _batch(options: argparse.Namespace) -> int:
         folder,
         options.definitions,
         options.stage,
+        options.plugins,
     )
     outcomes = run_batch(
         jobs,

@@ -21,7 +21,7 @@ def add_check_command(commands: argparse._SubParsersAction) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     settings = chosen_settings(options)
-    scene = load(options)
+    scene = load(options, config=settings.config)
     from fd_mitsuba.runs.check import check_scene
 
     report = check_scene(scene, settings.config)

@@ -143,6 +143,8 @@ def _as_given(options: argparse.Namespace) -> list[str]:
     for name in ("judge", "views", "size", "spp", "pictures", "scenes", "variant"):
         value = getattr(options, name)
         words += [] if value is None else [f"--{name}", str(value)]
+    for module in options.plugins:
+        words += ["--plugin", module]
     return words
 
 
@@ -172,7 +174,15 @@ def run_scenes(options: argparse.Namespace, scenes: list[Path]) -> tuple[list[Pa
     from fd_mitsuba.batch.local import job_matrix, run_batch
 
     folder = Path(options.output)
-    jobs = job_matrix(scenes, [Path(options.config)], options.seeds, options.overrides, folder, stage=options.stage)
+    jobs = job_matrix(
+        scenes,
+        [Path(options.config)],
+        options.seeds,
+        options.overrides,
+        folder,
+        stage=options.stage,
+        plugins=options.plugins,
+    )
     # One seed after the other, so that a batch that is stopped has something of every scene.
     jobs.sort(key=lambda job: options.seeds.index(job.seed))
     outcomes = run_batch(jobs, options.workers, remark, record=folder / "batch.json")

@@ -20,7 +20,7 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
         nargs="+",
         default=["glb", "obj", "ply", "mitsuba"],
         metavar="FORMAT",
-        help="any of glb obj ply mitsuba; default: all",
+        help="any of glb obj ply mitsuba, or what a plugin registers; default: those four",
     )
     export.add_argument("--faces", type=int, metavar="N", help="at most so many triangles a part; default: all")
     export.add_argument("--texture-size", type=int, default=1024, metavar="N", help="texels a side; default: 1024")
@@ -91,9 +91,11 @@ def _render(options: argparse.Namespace) -> int:
 
 def _export(options: argparse.Namespace) -> int:
     start(options)
+    from fd_mitsuba.config.toml_reading import read_choice
     from fd_mitsuba.runs.pipeline import export_run
 
-    written = export_run(Path(options.run), options.formats, options.texture_size, remark, options.faces)
+    formats = [read_choice(item) for item in options.formats]
+    written = export_run(Path(options.run), formats, options.texture_size, remark, options.faces)
     if options.json:
         print(json.dumps(written, indent=2))
         return 0

@@ -24,6 +24,7 @@ from fd_mitsuba.cli.demo import add_demo_command
 from fd_mitsuba.cli.doctor import add_doctor_command
 from fd_mitsuba.cli.evaluate import add_evaluate_commands
 from fd_mitsuba.cli.export import add_export_commands
+from fd_mitsuba.cli.names import add_names_command
 from fd_mitsuba.cli.options import remark
 from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
@@ -116,6 +117,7 @@ def command_parser() -> argparse.ArgumentParser:
         add_report_commands,
         add_evaluate_commands,
         add_ablate_commands,
+        add_names_command,
         add_doctor_command,
         add_prior_commands,
     ):

@@ -12,17 +12,30 @@ from fd_mitsuba.errors import UserError, printable
 
 
 def machine_options(parser: argparse.ArgumentParser) -> None:
-    """-m, -t and -v."""
+    """-m, -t, --plugin and -v."""
     parser.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant")
     parser.add_argument(
         "-t", "--threads", type=int, default=0, metavar="N", help="threads; 0: all cores, 1: bit-reproducible"
     )
+    plugin_option(parser)
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and library warnings")
 
 
 def say(text: object) -> None:
     """Print lines to stdout, with nothing in them that a terminal obeys."""
     print("\n".join(printable(line) for line in str(text).split("\n")))
+
+
+def plugin_option(parser: argparse.ArgumentParser) -> None:
+    """--plugin."""
+    parser.add_argument(
+        "--plugin",
+        dest="plugins",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="import a module or .py file that you trust, which registers losses, formats and the like",
+    )
 
 
 def remark(line: str) -> None:
@@ -57,6 +70,9 @@ def start(options: argparse.Namespace) -> None:
     from fd_mitsuba.backend.threads import share_cores
 
     share_cores(options.threads, options.variant)
+    from fd_mitsuba.config.registry import load_plugins
+
+    load_plugins(options.plugins)
 
 
 def quiet_libraries(options: argparse.Namespace) -> None:

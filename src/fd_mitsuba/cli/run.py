@@ -38,7 +38,7 @@ def run_options(parser: argparse.ArgumentParser, folder: str) -> None:
 def run_scene(options: argparse.Namespace) -> int:
     """Edit `options.scene`, print where the result is and how good it is."""
     settings = chosen_settings(options)
-    scene = load(options)
+    scene = load(options, config=settings.config)
     from fd_mitsuba.api import STAGES, edit
 
     run = edit(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fd_mitsuba.cli.options import definitions, given_text, machine_options, quiet_libraries
 from fd_mitsuba.errors import UserError
 
 if TYPE_CHECKING:
-    from fd_mitsuba.config import ChosenSettings
+    from fd_mitsuba.config import ChosenSettings, RunConfig
     from fd_mitsuba.scene.edit_scene import EditScene
 
 
@@ -49,11 +50,21 @@ def chosen_settings(options: argparse.Namespace) -> ChosenSettings:
     """The settings that the options ask for, and how they were chosen where the options do not say."""
     from fd_mitsuba.config import settings_for_run
 
-    return settings_for_run(options.config, options.overrides)
+    chosen = settings_for_run(options.config, options.overrides)
+    plugins = tuple(dict.fromkeys([*chosen.config.plugins, *options.plugins]))
+    return replace(chosen, config=chosen.config.model_copy(update={"plugins": plugins}))
 
 
-def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] | None = None) -> EditScene:
-    """The scene, with Mitsuba started by the options; `on_misplaced` as in `api.load_scene`."""
+def load(
+    options: argparse.Namespace,
+    on_misplaced: Callable[[UserError], None] | None = None,
+    config: RunConfig | None = None,
+) -> EditScene:
+    """The scene, with Mitsuba started by the options; `on_misplaced` as in `api.load_scene`.
+
+    Args:
+        config: whose plugins are imported, besides those of the options.
+    """
     parameters = definitions(options)
     quiet_libraries(options)
     from fd_mitsuba.api import load_scene
@@ -66,4 +77,5 @@ def load(options: argparse.Namespace, on_misplaced: Callable[[UserError], None] 
         threads=options.threads,
         variant=options.variant,
         on_misplaced=on_misplaced,
+        plugins=options.plugins if config is None else config.plugins,
     )

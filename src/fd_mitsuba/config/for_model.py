@@ -52,7 +52,9 @@ def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -
 
 
 def misfits(config: RunConfig) -> list[str]:
-    """A line that names the settings which do not fit the guidance model; none where all do."""
+    """A line that names the settings which do not fit the guidance model; none where all do, or where none is used."""
+    if config.guidance.kind.kind != "diffusion":
+        return []
     small = is_small_prior(config.guidance.model)
     if config.geometry.lambda_sds == 0 and config.appearance.lambda_sds == 0:
         return []

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
-from fd_mitsuba.config.identity import identity_settings
+from fd_mitsuba.config.identity import MAY_CHANGE, identity_settings
 from fd_mitsuba.config.sections import (
     AppearanceConfig,
     CamerasConfig,
@@ -25,6 +25,8 @@ from fd_mitsuba.config.sections import (
 from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml, shortened
 from fd_mitsuba.errors import UserError
 
+_CHOICES = ("kind", "variant")
+"""The settings of `guidance` that name an entry of a registry."""
 _NEWER = {"geometry.lambda_tether": 0.0, "geometry.start_variety": 0.0}
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
@@ -34,6 +36,8 @@ class RunConfig(Section):
 
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
     """All random numbers of a run follow from it."""
+    plugins: Annotated[tuple[str, ...], MAY_CHANGE] = ()
+    """Modules, or .py files, that are imported before a run, so that they register what the settings name."""
     field: FieldConfig = FieldConfig()
     geometry: GeometryConfig = GeometryConfig()
     texture: TextureConfig = TextureConfig()
@@ -96,3 +100,25 @@ class RunConfig(Section):
         """Sixteen hex digits that change with any setting in `identity`."""
         text = json.dumps(self.identity(stage), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def names_entries(self) -> bool:
+        """Whether anything is named besides the defaults, which only the registries can check."""
+        usual = GuidanceConfig()
+        named = any(getattr(self.guidance, name) != getattr(usual, name) for name in _CHOICES)
+        return named or bool(self.geometry.losses or self.appearance.losses)
+
+    def completed_by(self, other: RunConfig) -> RunConfig:
+        """These settings with the options that `other`'s choices of the same names have besides."""
+        guidance = {name: getattr(self.guidance, name).completed_by(getattr(other.guidance, name)) for name in _CHOICES}
+        changed: dict[str, Any] = {"guidance": self.guidance.model_copy(update=guidance)}
+        for stage in ("geometry", "appearance"):
+            section, theirs = getattr(self, stage), getattr(other, stage).losses
+            losses = {
+                name: loss.with_options(loss.choice(name).completed_by(theirs[name].choice(name)).options)
+                if name in theirs
+                else loss
+                for name, loss in section.losses.items()
+            }
+            changed[stage] = section.model_copy(update={"losses": losses})
+        return self.model_copy(update=changed)

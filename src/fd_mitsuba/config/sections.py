@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
 from fd_mitsuba.conventions import TextureChannel, Weighting
 
@@ -120,6 +121,8 @@ class GeometryConfig(Section):
     """Share of each region, outside the base, that it keeps filled."""
     lambda_tether: Weight = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
+    losses: dict[str, Weighted] = {}
+    """Losses of other modules by name, each with its `lambda` and its own settings; see docs/extending.md."""
     views: Views = 4
     """Cameras a step."""
     spp: Samples = 4
@@ -231,6 +234,8 @@ class AppearanceConfig(Section):
     """The part's boundary is its surface within this distance of the base, canonical units."""
     lambda_bend: Weight = 0.0
     """Price on bends of the shading normal, so that they are detail and not a lean of the whole part to the light."""
+    losses: dict[str, Weighted] = {}
+    """As `geometry.losses`, on the texture field."""
     single_path: bool = False
     """The paper's ablation: one field for the whole object, the base included."""
 
@@ -254,16 +259,12 @@ class AppearanceConfig(Section):
 class GuidanceConfig(Section):
     """The model that guides both stages, and how its gradient is made."""
 
+    kind: Choice = Choice(kind="diffusion")
+    """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
     model: Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
-    variant: Literal["sds", "csd", "ism", "reconstruction"] = "sds"
-    """What makes the gradient; `guidance.variants` has the formulas."""
-    reconstruction_steps: Annotated[int, Field(ge=1, le=50)] = 4
-    """DDIM steps from z_t to the clean latents, for `reconstruction`."""
-    ism_interval: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Distance between the two noise levels that `ism` compares, as a share of all timesteps."""
-    ism_inversion_step: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Stride of the DDIM inversion up to the lower of them; each stride is one pass of the network."""
+    variant: Choice = Choice(kind="sds")
+    """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0
@@ -286,6 +287,11 @@ class GuidanceConfig(Section):
     """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
     view_prompts: bool = True
     """Add words for the view's direction to the prompt."""
+
+    @property
+    def source(self) -> str:
+        """What guides, for messages and records: the model, or the name of another module's guidance."""
+        return self.model if self.kind.kind == "diffusion" else self.kind.kind
 
 
 class CamerasConfig(Section):

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
@@ -75,11 +76,27 @@ def apply_override(data: dict[str, Any], item: str) -> str:
     *sections, name = [part.strip() for part in key.split(".")]
     target = data
     for section in sections:
+        if isinstance(target.get(section), str):  # the name of a choice, which may be followed by its options
+            target[section] = {"kind": target[section]}
         target = target.setdefault(section, {})
         if not isinstance(target, dict):
             raise UserError(f"--set {shortened(item)}: {section!r} is a value, not a section")
     target[name] = value
     return ".".join([*sections, name])
+
+
+def read_choice(text: str) -> Choice:
+    """A choice as words of the command line: `stl`, or with options `stl {scale = 1000}`.
+
+    Raises:
+        UserError: the options are no TOML table.
+    """
+    name, brace, options = text.partition("{")
+    try:
+        own = tomllib.loads(f"own = {brace}{options}")["own"] if brace else {}
+    except tomllib.TOMLDecodeError:
+        raise UserError(f"{text}: write NAME, or 'NAME {{key = value}}'") from None
+    return Choice.of(name.strip(), own)
 
 
 def guilty_override(error: ValidationError, items: dict[str, str]) -> str | None:
@@ -102,7 +119,7 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model) if "." in key else list(model.model_fields)
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.4)
-        hint = f"nearest: {', '.join(near)}" if near else f"sections: {', '.join(model.model_fields)}"
+        hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(model.model_fields) or 'none'}"
         return f"unknown key {shortened(key)!r}; {hint}"
     return f"{key + ': ' if key else ''}{problem['msg']} (given: {_given(problem['input'])}); change the value"
 

@@ -114,7 +114,7 @@ def evaluate_run(
         "prompt": own.prompt,
         "base_prompt": own.base_prompt,
         "seed": config.seed,
-        "guidance_model": config.guidance.model,
+        "guidance_model": config.guidance.source,
         "steps": [config.geometry.steps, None if appearance is None else config.appearance.steps],
         "judge": judge.name,
         "views": about_views(views),

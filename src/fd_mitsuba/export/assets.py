@@ -7,29 +7,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fd_mitsuba import __version__
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.bake.tangents import vertex_tangents
-from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
+from fd_mitsuba.export.base_shapes import base_shapes
 from fd_mitsuba.export.cut_shapes import CutBase
-from fd_mitsuba.export.gltf import GltfMesh, glb_bytes, is_placement
+from fd_mitsuba.export.formats import EXPORTERS, FORMATS, ExportContent, Exporter, shape_name
 from fd_mitsuba.export.meshes import copy_base
-from fd_mitsuba.export.mitsuba_files import write_mitsuba
-from fd_mitsuba.export.obj import ObjMesh, obj_files
-from fd_mitsuba.export.ready_part import PartAsset, ReadyPart, ready_part
+from fd_mitsuba.export.ready_part import PartAsset, ready_part
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.io.safe_text import safe_name
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-
-FORMATS = ("glb", "obj", "ply", "mitsuba")
 
 
 def export_assets(
@@ -37,7 +30,7 @@ def export_assets(
     config: RunConfig,
     parts: Mapping[str, PartAsset],
     folder: Path,
-    formats: Collection[str] = FORMATS,
+    formats: Collection[str | Choice] = FORMATS,
     texture_size: int = 1024,
     say: Callable[[str], None] = lambda line: None,
     cut: CutBase | None = None,
@@ -51,7 +44,7 @@ def export_assets(
     Args:
         parts: name -> part.
         folder: is made if it is missing; files of the same name are replaced.
-        formats: of `FORMATS`.
+        formats: names of `EXPORTERS`, or choices with their options.
         texture_size: texels a side of each part's textures.
         say: takes remarks, a line each.
         cut: the base without the parts, where these were removed from it: it is written, in place of base and parts.
@@ -64,7 +57,8 @@ def export_assets(
         UserError: an unknown format or texture size, names that clash, a part without volume, a file of the scene that
             is gone, a folder that cannot be written.
     """
-    _check(scene, parts, folder, formats, texture_size)
+    exporters = chosen_exporters(formats)
+    _check(scene, parts, folder, texture_size)
     inputs = scene.inputs()
     file = inputs.scene
     states = {part.name: part for part in read_stack(folder / "mitsuba")[0] if part.state != SHOWN}
@@ -90,22 +84,11 @@ def export_assets(
         write_atomically(folder / name, data)
         written.append(name)
 
-    if "glb" in formats:
-        write("asset.glb", glb_bytes(_gltf_meshes(scene, shapes, ready, extras), extras))
-    if "obj" in formats:
-        for name, data in obj_files(_obj_meshes(scene, shapes, ready)).items():
-            write(f"obj/{name}", data)
-    if "ply" in formats:
-        for name, source in _earlier_files(kept, cut).items():
-            write(f"ply/{safe_name(name, suffix='.ply')}", source.read_bytes())
-        for part in ready:
-            write(f"ply/{part.label}.ply", part.ply())
-        for name, data in cut.files().items() if cut is not None else ():
-            write(f"ply/{name}", data)
-    if "mitsuba" in formats:
-        corrected = {i: shape.corrected for i, shape in enumerate(whole) if shape is not None and shape.corrected}
-        settings = {"texture_size": texture_size, "faces": face_budget}
-        write_mitsuba(scene, inputs, ready, write, cut, states, settings, corrected)
+    corrected = {i: shape.corrected for i, shape in enumerate(whole) if shape is not None and shape.corrected}
+    record = {"texture_size": texture_size, "faces": face_budget}
+    content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write)
+    for exporter in exporters:
+        exporter.write(content)
     return {
         "files": written,
         "base_identical": identical,
@@ -114,12 +97,19 @@ def export_assets(
     }
 
 
-def _check(
-    scene: EditScene, parts: Mapping[str, PartAsset], folder: Path, formats: Collection[str], texture_size: int
-) -> None:
-    unknown = sorted(set(formats) - set(FORMATS))
-    if unknown:
-        raise UserError(f"--format {unknown[0]}: unknown; choose from {', '.join(FORMATS)}")
+def chosen_exporters(formats: Collection[str | Choice]) -> list[Exporter]:
+    """The exporters of formats: built-in ones in their own order, then others in that given.
+
+    Raises:
+        UserError: an unknown format, or wrong options.
+    """
+    choices = [Choice.of(item) if isinstance(item, str) else item for item in formats]
+    wanted = {choice.kind: choice for choice in choices}
+    names = [*(name for name in FORMATS if name in wanted), *(name for name in wanted if name not in FORMATS)]
+    return [EXPORTERS.make(wanted[name], "--format") for name in names]
+
+
+def _check(scene: EditScene, parts: Mapping[str, PartAsset], folder: Path, texture_size: int) -> None:
     if not 16 <= texture_size <= 8192:
         raise UserError(f"--texture-size {texture_size}: give a number from 16 to 8192")
     if not parts:
@@ -149,14 +139,6 @@ def _cut_faces(cut: CutBase, parts: Mapping[str, PartAsset]) -> dict[str, PartAs
     }
 
 
-def shape_name(scene: EditScene, name: str) -> str:
-    """A base mesh's name in the exports: `base`, `base_<name>` where there are several, `part_<name>` of old parts."""
-    earlier = {part.shape for part in scene.earlier}
-    if name in earlier:
-        return name
-    return BASE_NAME if len(scene.base) - len(earlier) == 1 else f"{BASE_NAME}_{name}"
-
-
 def _base_textures(file: SceneFile, absent: Collection[str]) -> list[Path]:
     """Picture files that the materials of the scene's shapes read, without those of shapes with the ids `absent`."""
     found: dict[Path, None] = {}
@@ -173,69 +155,3 @@ def _base_textures(file: SceneFile, absent: Collection[str]) -> list[Path]:
         if element.id not in absent:
             visit(element)
     return list(found)
-
-
-def _earlier_files(scene: EditScene, cut: CutBase | None) -> dict[str, Path]:
-    """Shape -> the PLY of every part of an earlier round that is still what it was."""
-    earlier = {part.shape for part in scene.earlier}
-    changed = (
-        {shape.name for shape, is_cut in zip(cut.shapes, cut.is_cut, strict=True) if is_cut and shape} if cut else ()
-    )
-    files = {mesh.name: mesh.source_files[0] for mesh in scene.base if mesh.name in earlier and mesh.source_files}
-    return {name: file for name, file in files.items() if name not in changed and file.suffix == ".ply"}
-
-
-def _gltf_meshes(
-    scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart], extras: dict[str, Any]
-) -> list[GltfMesh]:
-    meshes, away = [], np.eye(4)
-    away[:3, 3] = scene.origin  # a GLB has 32 bits for positions, and 64 for a node's place
-    earlier = {part.shape: part for part in scene.earlier}
-    for shape in shapes:
-        vertices, faces, normals, place = shape.vertices, shape.faces, shape.normals, shape.to_world
-        if not is_placement(place) or np.linalg.det(place[:3, :3]) < 0:
-            vertices, faces, normals = shape.in_user_frame()
-            vertices, place = vertices - scene.origin, away
-        tangents = None
-        if shape.material.normal_picture is not None and normals is not None and shape.uv is not None:
-            tangents = vertex_tangents(vertices, faces, normals, shape.uv)
-        name = shape_name(scene, shape.name)
-        parent = "" if name == BASE_NAME or shape.name in earlier else BASE_NAME
-        about: dict[str, Any] = {"shape": shape.name}
-        if old := earlier.get(shape.name):
-            about = {"part": old.name, "prompt": old.prompt, "round": old.round}
-        meshes.append(
-            GltfMesh(
-                name, vertices, faces, shape.material, normals, shape.uv, tangents, shape.colours, place, parent, about
-            )
-        )
-    for part in parts:
-        mesh = part.mesh
-        tangents = vertex_tangents(mesh.vertices, mesh.faces, mesh.normals, mesh.uv)
-        about = {**extras, "part": part.name}
-        meshes.append(
-            GltfMesh(
-                part.label,
-                mesh.vertices - scene.origin,
-                mesh.faces,
-                part.material,
-                mesh.normals,
-                mesh.uv,
-                tangents,
-                to_world=away,
-                extras=about,
-            )
-        )
-    return meshes
-
-
-def _obj_meshes(scene: EditScene, shapes: list[BaseShape], parts: list[ReadyPart]) -> list[ObjMesh]:
-    meshes = []
-    for shape in shapes:
-        vertices, faces, normals = shape.in_user_frame()
-        name = shape_name(scene, shape.name)
-        meshes.append(ObjMesh(name, vertices, faces, shape.material, normals, shape.uv, shape.colours))
-    for part in parts:
-        mesh = part.mesh
-        meshes.append(ObjMesh(part.label, mesh.vertices, mesh.faces, part.material, mesh.normals, mesh.uv))
-    return meshes

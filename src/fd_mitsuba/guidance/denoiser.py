@@ -12,7 +12,7 @@ from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
 from fd_mitsuba.guidance.model_conventions import FILE_NAME
 from fd_mitsuba.guidance.side_by_side import cores_for_samples, of_samples
-from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation, Query, passes_of
+from fd_mitsuba.guidance.variants import Chunk, Distillation, Query, passes_of
 
 
 class Denoiser:
@@ -80,5 +80,5 @@ class Denoiser:
     @torch.no_grad()
     def latent_gradient(self, chunk: Chunk, how: Distillation) -> tuple[Tensor, Tensor]:
         """Gradient with respect to z, and the clean latents that the network sees in z_t."""
-        gradient, preview = VARIANTS[how.variant](Query(self, chunk, how))
+        gradient, preview = how.variant.gradient(Query(self, chunk, how))
         return gradient if chunk.mask is None else gradient * chunk.mask, preview

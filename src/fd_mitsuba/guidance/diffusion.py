@@ -26,7 +26,7 @@ from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, Guida
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
-from fd_mitsuba.guidance.variants import Chunk, Distillation
+from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -50,6 +50,7 @@ class DiffusionGuidance(Denoiser):
     ) -> None:
         super().__init__(components, config, device)
         self.appearance = appearance or AppearanceConfig()
+        self.variant = VARIANTS.make(config.variant, "guidance.variant")
         self.conventions = components.conventions
         self.view_grid = components.conventions.view_grid
         self.normal_space = components.conventions.normal_space
@@ -234,14 +235,7 @@ class DiffusionGuidance(Denoiser):
             settings = self.config
             bounds = settings.timestep_range_refined if phase == "refined" else settings.timestep_range_coarse
         return Distillation(
-            self.config.variant,
-            settings.weighting,
-            settings.guidance_scale,
-            settings.image_guidance_scale,
-            bounds,
-            self.config.reconstruction_steps,
-            self.config.ism_interval,
-            self.config.ism_inversion_step,
+            self.variant, settings.weighting, settings.guidance_scale, settings.image_guidance_scale, bounds
         )
 
     def embeddings(self, prompts: list[str], passes: Iterable[str]) -> dict[str, Tensor]:

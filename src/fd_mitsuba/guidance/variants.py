@@ -1,5 +1,7 @@
 """The variants of `guidance.variant`: how a diffusion model's noise becomes a gradient for clean latents.
 
+An entry of `VARIANTS` each, with its own settings: `guidance.variant = {kind = "ism", interval = 0.1}`.
+
 Symbols as in `sds`; g is the gradient with respect to z, z_hat the clean latents it pulls towards. e(text) is the noise
 that the network sees with the prompt, e(free) that without: with the negative prompt, and for a network that sees the
 base with the base's picture. e_hat is classifier-free guidance of the two (`sds.cfg_coefficients`).
@@ -9,17 +11,44 @@ The network itself, a `Network`, may predict e, v or z and take 4 or 8 channels;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from fd_mitsuba.config import Section
+from fd_mitsuba.config.registry import Registry
 from fd_mitsuba.conventions import Weighting
 from fd_mitsuba.guidance import sds
 
-Variant = Literal["sds", "csd", "ism", "reconstruction"]
+Pass = Literal["guided", "text", "free"]
+
+
+class Variant(ABC):
+    """Makes a gradient for clean latents of what the network sees.
+
+    Attributes:
+        passes: the network's passes that `gradient` asks for: `guided` (those of classifier-free guidance), `text`,
+            `free` (that without the prompt).
+        settings: its own, as the registry has checked them.
+    """
+
+    passes: ClassVar[tuple[Pass, ...]] = ("guided",)
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        """g with respect to z, and the clean latents z_hat to show; both (n, 4, L, L), on the network's device."""
+
+
+VARIANTS: Registry[type[Variant]] = Registry("variants", "guidance variant")
+"""Called with their settings."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +60,6 @@ class Distillation:
     guidance_scale: float
     image_guidance_scale: float
     timestep_range: tuple[float, float]
-    reconstruction_steps: int = 4
-    ism_interval: float = 0.05
-    ism_inversion_step: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -93,6 +119,8 @@ class Query:
     def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
         """Noise of each named pass."""
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
+        if missing := set(names) - set(texts):
+            raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
         return self.network.predict_noise(z_t, timesteps, texts, self.chunk.condition)
 
     def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
@@ -109,74 +137,100 @@ class Query:
         return torch.where(self.chunk.mask > 0, moved, outside)
 
 
-def score_distillation(query: Query) -> tuple[Tensor, Tensor]:
+@VARIANTS.register("sds")
+class ScoreDistillation(Variant):
     """g = w(t) (e_hat(z_t) - e): SDS (DreamFusion, arXiv 2209.14988; the paper's section "Preliminary")."""
-    timesteps = query.chunk.timesteps
-    z_t = query.noised(timesteps)
-    noise_hat = query.guided(z_t, timesteps)
-    preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
-    return sds.sds_gradient(noise_hat, query.noise, query.weights()), preview
+
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        timesteps = query.chunk.timesteps
+        z_t = query.noised(timesteps)
+        noise_hat = query.guided(z_t, timesteps)
+        preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
+        return sds.sds_gradient(noise_hat, query.noise, query.weights()), preview
 
 
-def classifier_score(query: Query) -> tuple[Tensor, Tensor]:
+@VARIANTS.register("csd")
+class ClassifierScore(Variant):
     """g = w(t) (e(text; z_t) - e(free; z_t)): CSD (arXiv 2310.19415). The guidance scale plays no part in it."""
-    timesteps = query.chunk.timesteps
-    z_t = query.noised(timesteps)
-    seen = query.passes(z_t, timesteps, ("text", query.free))
-    preview = sds.clean_estimate(z_t, seen["text"], query.alpha_bar(timesteps))
-    return sds.csd_gradient(seen["text"], seen[query.free], query.weights()), preview
+
+    passes = ("text", "free")
+
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        timesteps = query.chunk.timesteps
+        z_t = query.noised(timesteps)
+        seen = query.passes(z_t, timesteps, ("text", query.free))
+        preview = sds.clean_estimate(z_t, seen["text"], query.alpha_bar(timesteps))
+        return sds.csd_gradient(seen["text"], seen[query.free], query.weights()), preview
 
 
-def interval_score(query: Query) -> tuple[Tensor, Tensor]:
+class IntervalSettings(Section):
+    """Of `ism`."""
+
+    interval: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """Distance between the two noise levels that are compared, as a share of all timesteps."""
+    inversion_step: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """Stride of the DDIM inversion up to the lower of them; each stride is one pass of the network."""
+
+
+@VARIANTS.register("ism", IntervalSettings)
+class IntervalScore(Variant):
     """g = w(t) (e_hat(z_t) - e(free; z_s)): ISM (LucidDreamer, arXiv 2311.11284).
 
     s = t - delta_T. z_s is z carried from timestep 0 to s by DDIM inversion in steps of delta_S, z_t is z_s carried one
     step further, both by e(free): the drawn noise enters at timestep 0 only, where there is next to none. A picture
     whose s is reached waits for its neighbours, and its result does not depend on them.
     """
-    last, how = len(query.network.alpha_bars) - 1, query.how
-    interval, stride = (max(1, round(share * last)) for share in (how.ism_interval, how.ism_inversion_step))
-    end = query.chunk.timesteps
-    start = (end - interval).clamp(min=0)
-    now = torch.zeros_like(end)
-    z_s = query.noised(now)
-    for _ in range(-(-int(start.max()) // stride)):
-        following = torch.minimum(now + stride, start)
-        moved = query.move(z_s, query.passes(z_s, now, (query.free,))[query.free], now, following)
-        z_s = torch.where((following > now).view(-1, 1, 1, 1), moved, z_s)
-        now = following
-    noise_start = query.passes(z_s, start, (query.free,))[query.free]
-    z_t = query.move(z_s, noise_start, start, end)
-    noise_hat = query.guided(z_t, end)
-    preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(end))
-    return sds.sds_gradient(noise_hat, noise_start, query.weights()), preview
+
+    passes = ("guided", "free")
+    settings: IntervalSettings
+
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        last, own = len(query.network.alpha_bars) - 1, self.settings
+        interval, stride = (max(1, round(share * last)) for share in (own.interval, own.inversion_step))
+        end = query.chunk.timesteps
+        start = (end - interval).clamp(min=0)
+        now = torch.zeros_like(end)
+        z_s = query.noised(now)
+        for _ in range(-(-int(start.max()) // stride)):
+            following = torch.minimum(now + stride, start)
+            moved = query.move(z_s, query.passes(z_s, now, (query.free,))[query.free], now, following)
+            z_s = torch.where((following > now).view(-1, 1, 1, 1), moved, z_s)
+            now = following
+        noise_start = query.passes(z_s, start, (query.free,))[query.free]
+        z_t = query.move(z_s, noise_start, start, end)
+        noise_hat = query.guided(z_t, end)
+        preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(end))
+        return sds.sds_gradient(noise_hat, noise_start, query.weights()), preview
 
 
-def reconstruction(query: Query) -> tuple[Tensor, Tensor]:
+class ReconstructionSettings(Section):
+    """Of `reconstruction`."""
+
+    steps: Annotated[int, Field(ge=1, le=50)] = 4
+    """DDIM steps from z_t to the clean latents."""
+
+
+@VARIANTS.register("reconstruction", ReconstructionSettings)
+class Reconstruction(Variant):
     """g = w(t) (z - z_hat), z_hat after DDIM steps from z_t by e_hat (HiFA, arXiv 2305.18766).
 
     With many steps z_hat is the edited picture of an iterative dataset update (Instruct-NeRF2NeRF, arXiv 2303.12789).
     The steps are evenly spaced from t to the clean latents.
     """
-    now, steps = query.chunk.timesteps, query.how.reconstruction_steps
-    z_t = query.noised(now)
-    noise_hat = query.guided(z_t, now)
-    for remaining in range(steps - 1, 0, -1):
-        following = query.chunk.timesteps * remaining // steps
-        z_t = query.move(z_t, noise_hat, now, following)
-        now = following
+
+    settings: ReconstructionSettings
+
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        now, steps = query.chunk.timesteps, self.settings.steps
+        z_t = query.noised(now)
         noise_hat = query.guided(z_t, now)
-    z_hat = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(now))
-    return sds.reconstruction_gradient(query.chunk.z, z_hat, query.weights()), z_hat
-
-
-VARIANTS: dict[Variant, Callable[[Query], tuple[Tensor, Tensor]]] = {
-    "sds": score_distillation,
-    "csd": classifier_score,
-    "ism": interval_score,
-    "reconstruction": reconstruction,
-}
-"""Each gives g and z_hat, both (n, 4, L, L)."""
+        for remaining in range(steps - 1, 0, -1):
+            following = query.chunk.timesteps * remaining // steps
+            z_t = query.move(z_t, noise_hat, now, following)
+            now = following
+            noise_hat = query.guided(z_t, now)
+        z_hat = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(now))
+        return sds.reconstruction_gradient(query.chunk.z, z_hat, query.weights()), z_hat
 
 
 def free_pass(needs_base: bool) -> str:
@@ -193,8 +247,5 @@ def guidance_coefficients(how: Distillation, needs_base: bool) -> dict[str, floa
 
 def passes_of(how: Distillation, needs_base: bool) -> tuple[str, ...]:
     """Names of all passes that the variant asks for; a pass without weight is left out."""
-    free = free_pass(needs_base)
-    if how.variant == "csd":
-        return "text", free
-    names = tuple(guidance_coefficients(how, needs_base))
-    return (*names, free) if how.variant == "ism" and free not in names else names
+    names = {"guided": guidance_coefficients(how, needs_base), "text": ("text",), "free": (free_pass(needs_base),)}
+    return tuple(dict.fromkeys(name for asked in how.variant.passes for name in names[asked]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,9 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.guidance.interface import AppearanceGuidance
+from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.guidance.sources import load_guidance
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.io.picture import write_picture
 from fd_mitsuba.io.ply import read_ply
@@ -100,15 +102,16 @@ def prepare_appearance(
     config: RunConfig,
     say: Callable[[str], None],
     say_of_prompt: Callable[[str], None],
-    shared: DiffusionGuidance | None = None,
-    given: AppearanceGuidance | None = None,
+    shared: Guidance | None = None,
+    given: Guidance | None = None,
 ) -> AppearanceGuidance | None:
     """Check what the appearance stage needs of the scene, and load its guidance; before anyone waits for a run.
 
     Args:
         say: takes log lines about the scene, `say_of_prompt` those about the prompt's words.
         shared: the geometry stage's guidance, so that a large model is loaded once.
-        given: a caller's own guidance, in place of the one that `guidance.model` names.
+        given: a caller's own guidance, in place of the one that `guidance.kind` names. Whichever it is, where it has no
+            `guide_appearance` the diffusion model of `guidance.model` takes this stage.
 
     Raises:
         UserError: see `check_appearance_inputs`, `part_material`, `DiffusionGuidance.load`, `check_views` and
@@ -120,18 +123,26 @@ def prepare_appearance(
     part_material(scene, config.appearance.fixed, config.appearance.normal_map)
     if config.appearance.lambda_sds == 0:
         return None
-    if given is not None:
-        check_views(AppearanceStage.name, config, given)
-        return with_prompt(given, scene, say_of_prompt)
-    if shared is None:
-        guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
-    else:
+    if (own := _own_guidance(config, shared, given)) is not None:
+        check_views(AppearanceStage.name, config, own)
+        return with_prompt(own, scene, say_of_prompt)
+    if isinstance(shared, DiffusionGuidance):
         guidance = shared.for_appearance(config.appearance)
+    else:
+        guidance = DiffusionGuidance.load(config.guidance, appearance=config.appearance)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
     check_views(AppearanceStage.name, config, guidance)
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt, scene.base_prompt)
     return guidance
+
+
+def _own_guidance(config: RunConfig, shared: Guidance | None, given: Guidance | None) -> AppearanceGuidance | None:
+    """A caller's guidance or another module's, where it can guide the appearance."""
+    found: Any = given
+    if given is None and config.guidance.kind.kind != "diffusion":
+        found = load_guidance(config) if shared is None else shared
+    return found if hasattr(found, "guide_appearance") else None
 
 
 def finished_appearance(

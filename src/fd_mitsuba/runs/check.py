@@ -15,6 +15,7 @@ from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading
 from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_prompt
 from fd_mitsuba.io.float_steps import size_warnings
+from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs, check_shading
 from fd_mitsuba.scene.base_appearance import base_shapes
@@ -124,8 +125,10 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
     """The report on a scene that was loaded, for a run with `config`. Takes seconds; nothing is written.
 
     Raises:
-        UserError: what a run would refuse: a part all of whose regions lie within the base.
+        UserError: what a run would refuse: a part all of whose regions lie within the base, settings that name what is
+            not registered or give it wrong options.
     """
+    config = checked_choices(config)
     refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     reading, refusal = _prompt(scene, config)
     base = tuple(

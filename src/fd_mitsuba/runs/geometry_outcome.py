@@ -21,6 +21,7 @@ from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
+from fd_mitsuba.guidance.sources import load_guidance
 from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
@@ -30,6 +31,7 @@ from fd_mitsuba.runs.own_meshes import as_mesh, base_mesh, edited_mesh, start_me
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneFile
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.viewing.turntable import render_ring, write_sheet, write_video
@@ -43,16 +45,16 @@ def prepare_geometry(
     """The guidance of the geometry stage with the scene's prompt; None where it has no weight.
 
     Args:
-        given: a caller's own guidance, in place of the one that `guidance.model` names.
+        given: a caller's own guidance, in place of the one that `guidance.kind` and `guidance.model` name.
 
     Raises:
         UserError: a model that cannot be loaded, a prompt that it does not know, a cut that it cannot guide.
     """
     if config.geometry.lambda_sds == 0:
         return None
-    if given is not None:
-        return with_prompt(given, scene, say)
-    guidance = DiffusionGuidance.load(config.guidance)
+    guidance = load_guidance(config) if given is None else given
+    if given is not None or not isinstance(guidance, DiffusionGuidance):
+        return with_prompt(guidance, scene, say)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise cuts_are_unknown(scene.path)
     take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt)
@@ -74,10 +76,17 @@ def refuse_other_shape(before: EditScene, now: EditScene, source: Path) -> None:
     )
 
     def places(scene: EditScene) -> list[tuple]:
-        return [(region.name, region.part, region.mode, region.to_canonical.tobytes()) for region in scene.regions]
+        return [
+            (region.name, region.part, region.mode, region.to_canonical.tobytes(), _mesh_bytes(region.mesh))
+            for region in scene.regions
+        ]
 
     if not same_base or places(before) != places(now):
         raise UserError(f"{source}: its base or its focal regions are others than those of {now.path}; run anew")
+
+
+def _mesh_bytes(mesh: TriangleMesh | None) -> bytes:
+    return b"" if mesh is None else mesh.vertices.tobytes() + mesh.faces.tobytes()
 
 
 def take_geometry(source: Path, folder: Path) -> None:
@@ -127,7 +136,7 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
         "prompt": scene.prompt,
         "seed": config.seed,
         "steps": config.geometry.steps,
-        "guidance_model": config.guidance.model,
+        "guidance_model": config.guidance.source,
         **asdict(locality),
         "base_identical": identical,
         "part_faces": {name: len(solid.faces) for name, solid in parts.items()},

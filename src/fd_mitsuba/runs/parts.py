@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.assets import FORMATS
+from fd_mitsuba.export.formats import EXPORTERS
 from fd_mitsuba.export.mitsuba_xml import FILES
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.runs.pipeline import export_run
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.scene.part_stack import HIDDEN, RECORD_NAME, REMOVED, SHOWN, StackedPart, read_stack, stack_bytes
-
-_WRITTEN = {"glb": "asset.glb", "obj": "obj/asset.obj", "ply": "ply", "mitsuba": "mitsuba/scene.xml"}
-"""What each format leaves in the export folder."""
 
 _BAKED = ("base_color", "orm", "roughness", "metallic", "alpha", "normal", "normal_mitsuba")
 """Pictures that a part may have, whether its Mitsuba scene reads them or not."""
@@ -67,7 +64,7 @@ def _change_parts(
     if not any(part.state == SHOWN for part in changed):
         raise UserError(f"{run}: {names[0]!r} is the last part; show another one first, or use the base itself")
     folder = run / "export"
-    formats = [name for name in FORMATS if (folder / _WRITTEN[name]).exists()]
+    formats = [name for name in EXPORTERS.names() if (folder / EXPORTERS.entry(name, "format").make.leaves).exists()]
     record = folder / "mitsuba" / RECORD_NAME
     before = record.read_bytes()
     write_atomically(record, stack_bytes(changed, settings))

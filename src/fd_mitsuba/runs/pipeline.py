@@ -10,14 +10,14 @@ from typing import Any, Protocol
 from fd_mitsuba.backend.peak_memory import peak_memory_mb
 from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.assets import PartAsset, export_assets
+from fd_mitsuba.export.assets import PartAsset, chosen_exporters, export_assets
 from fd_mitsuba.export.part_record import part_record
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.export.solid.solid import LEAST_FACES, Solid
 from fd_mitsuba.fields.texture import TextureField
-from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.appearance_outcome import (
@@ -28,6 +28,7 @@ from fd_mitsuba.runs.appearance_outcome import (
     prepare_appearance,
     write_appearance,
 )
+from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import unet_weights
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.runs.geometry_outcome import (
@@ -127,11 +128,14 @@ def _run(
     judge: Judge | None,
 ) -> dict:
     started = time.monotonic()
+    config = checked_choices(config)
     for warning in scene.warnings:
         say(warning)
     refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     asked, with_assets = stages, "appearance" in stages
-    if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and config.guidance.model == "builtin":
+    diffusion = config.guidance.kind.kind == "diffusion"
+    by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(guidance, "guide_appearance")
+    if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and by_builtin:
         if "geometry" not in stages:
             raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
         say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
@@ -148,9 +152,8 @@ def _run(
     if "appearance" in stages:
         # Both priors know the same words: what the geometry stage has said of them is not said again.
         listener = (lambda line: None) if for_geometry is not None else say
-        loaded = for_geometry if isinstance(for_geometry, DiffusionGuidance) and guidance is None else None
-        own = guidance if hasattr(guidance, "guide_appearance") else None
-        for_appearance = prepare_appearance(scene, config, say, listener, loaded, own)
+        loaded = for_geometry if guidance is None else None
+        for_appearance = prepare_appearance(scene, config, say, listener, loaded, guidance)
 
     def begin() -> None:
         for line in opening:
@@ -212,7 +215,7 @@ def _run(
 
 def export_run(
     folder: Path,
-    formats: Collection[str],
+    formats: Collection[str | Choice],
     texture_size: int,
     say: Callable[[str], None] = print,
     faces: int | None = None,
@@ -227,6 +230,7 @@ def export_run(
     """
     if faces is not None and faces < LEAST_FACES:
         raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
+    chosen_exporters(formats)  # an unknown one is said before anything is loaded
     scene, config = saved_run(folder, say=say)
     with run_lock(folder, say):
         geometry = load_finished_stage(scene, config, folder)
@@ -239,7 +243,7 @@ def write_assets(
     geometry: GeometryStage,
     field: TextureField | None,
     folder: Path,
-    formats: Collection[str],
+    formats: Collection[str | Choice],
     texture_size: int,
     say: Callable[[str], None],
     faces: int | None = None,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fd_mitsuba.backend.threads import share_cores_once
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object
 
@@ -82,12 +83,13 @@ class Run:
         return trimesh.load_mesh(self.folder / "export" / f"part_{name}.ply", process=False)
 
     def export(
-        self, formats: Collection[str] = ALL_FORMATS, *, faces: int | None = None, texture_size: int = 1024
+        self, formats: Collection[str | Choice] = ALL_FORMATS, *, faces: int | None = None, texture_size: int = 1024
     ) -> list[Path]:
         """Write the result for other programs below `folder/export`; returns the files.
 
         Args:
-            formats: any of `glb`, `obj`, `ply`, `mitsuba`.
+            formats: any of `glb`, `obj`, `ply`, `mitsuba`, or what is registered besides; `Choice.of("mine", {...})`
+                for one with options.
             faces: at most so many triangles a part; None: all.
             texture_size: texels a side of the parts' textures.
 

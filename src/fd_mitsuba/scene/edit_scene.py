@@ -29,6 +29,7 @@ from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
 from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
+from fd_mitsuba.scene.region_shapes import ELLIPSOID
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
 
@@ -235,11 +236,13 @@ def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> 
     try:
         with file.searching():
             if element.plugin == FOCAL_REGION:
-                return region_triangles(file.mi, plain.get("filename"), to_world)
+                return region_triangles(file.mi, plain, to_world)
             triangles = shape_triangles(file.mi, element.plugin, plain, to_world)
             if element.plugin in FILE_SHAPES.values():
                 mark_sound(file, element)
             return triangles
+    except UserError as error:
+        raise element.error(str(error)) from None
     except NotAMesh:
         raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None
     except BrokenMesh as error:
@@ -299,15 +302,17 @@ def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame
     name = element.id or f"region_{index + 1}"
     mesh = None
     filename = element.properties.get("filename")
+    vertices, faces = _triangles(file, element, filename)
     if filename:
-        vertices, faces = _triangles(file, element, filename)
         if not topology(vertices, faces).closed:
             raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
         twice = len(faces) - len(without_reversed_copies(vertices, faces))
         if twice:
             problem = f"{twice} faces of the region's mesh are there twice, once each way round"
             raise element.error(f"{filename}: {problem}; remove the copies")
-        mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, (file.resolve(filename),))
+    if filename or element.properties.get("shape", ELLIPSOID) != ELLIPSOID:
+        sources = (file.resolve(filename),) if filename else ()
+        mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, sources)
     region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element))
     if not region.volume > 0:
         raise element.error("the region has no volume; enlarge it")

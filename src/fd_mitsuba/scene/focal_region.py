@@ -15,6 +15,7 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 ADD, SUBTRACT = "add", "subtract"
 """The modes of a region: its part joins the base, or is cut out of it."""
+_SURFACE_POINTS = 4096
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,17 @@ class FocalRegion:
         if np.linalg.det(linear) < 0:
             faces = faces[:, ::-1]
         return TriangleMesh(self.name, vertices @ linear.T + self.to_canonical[:3, 3], faces)
+
+    def surface_points(self) -> np.ndarray:
+        """(N, 3) points all over the region's surface, canonical frame; of a mesh not its vertices alone."""
+        if self.mesh is None:
+            return self.surface(3).vertices
+        corners = self.mesh.vertices[self.mesh.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        random = np.random.default_rng(0)
+        chosen = random.choice(len(corners), size=_SURFACE_POINTS, p=area / area.sum())
+        weights = random.dirichlet([1.0, 1.0, 1.0], size=_SURFACE_POINTS)
+        return np.concatenate([self.mesh.vertices, np.einsum("ij,ijk->ik", weights, corners[chosen])])
 
     @cached_property
     def _distance(self) -> MeshDistance:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fd_mitsuba.backend.startup import FACES, VERTICES
-from fd_mitsuba.conventions import DEFAULT_PART_NAME
-from fd_mitsuba.scene.focal_region import ADD
+from fd_mitsuba.config.choice import Choice
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, shape_triangles
-from fd_mitsuba.scene.tessellate import Arrays, unit_sphere
+from fd_mitsuba.scene.region_shapes import ELLIPSOID, REGION_SHAPES, shape_arrays
+from fd_mitsuba.scene.tessellate import Arrays
 
 FOCAL_REGION = "focal_region"
 DUAL_PATH = "dual_path"
@@ -34,30 +37,67 @@ def register(mi: Any) -> None:
     _registered.add(variant)
 
 
-def region_triangles(mi: Any, filename: str | None, to_world: np.ndarray, subdivisions: int = 4) -> Arrays:
-    """Vertices and faces after `to_world` of a region: the unit sphere, or the mesh in `filename`.
+def region_triangles(mi: Any, properties: Mapping[str, Any], to_world: np.ndarray) -> Arrays:
+    """Vertices and faces after `to_world` of a region: an entry of `REGION_SHAPES`, or the mesh in `filename`.
 
     Raises:
+        UserError: see `region_choice` and `region_shapes.shape_arrays`.
         ValueError: the file is of no mesh type. Further: see `mesh_source.shape_triangles`.
     """
-    if filename is None:
-        vertices, faces = unit_sphere(subdivisions)
-        if np.linalg.det(to_world[:3, :3]) < 0:
-            faces = faces[:, ::-1]
-        return vertices @ to_world[:3, :3].T + to_world[:3, 3], np.array(faces)
-    suffix = Path(filename).suffix.lower()
-    if suffix not in FILE_SHAPES:
-        raise ValueError(f"{filename!r} is not one of {', '.join(FILE_SHAPES)}")
-    return shape_triangles(mi, FILE_SHAPES[suffix], {"filename": filename}, to_world)
+    choice = region_choice(properties)
+    if choice is None:
+        filename = str(properties["filename"])
+        suffix = Path(filename).suffix.lower()
+        if suffix not in FILE_SHAPES:
+            raise ValueError(f"{filename!r} is not one of {', '.join(FILE_SHAPES)}")
+        return shape_triangles(mi, FILE_SHAPES[suffix], {"filename": filename}, to_world)
+    vertices, faces = shape_arrays(choice)
+    if np.linalg.det(to_world[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return vertices @ to_world[:3, :3].T + to_world[:3, 3], np.array(faces)
+
+
+def region_choice(properties: Mapping[str, Any]) -> Choice | None:
+    """The shape that a region's properties name, with its settings; None: it is a mesh from `filename`.
+
+    Raises:
+        UserError: both a shape and a file, an unknown shape, a property that it does not have.
+    """
+    shape = properties.get("shape")
+    options = {name: _plain(value) for name, value in properties.items() if name not in _OWN}
+    is_file = "filename" in properties
+    if is_file and shape is not None:
+        raise UserError(f"has the shape {shape!r} and a filename; keep one of them")
+    choice = Choice.of(ELLIPSOID if shape is None else str(shape), options)
+    fields = () if is_file else REGION_SHAPES.entry(choice.kind, "shape").settings.model_fields
+    for name in options:
+        if name not in fields:
+            near = difflib.get_close_matches(name, [*_OWN, *fields], n=3, cutoff=0.4)
+            hint = f"nearest: {', '.join(near)}; " if near else ""
+            raise UserError(f"no property {name!r} in a region of this shape; {hint}correct its name")
+    return None if is_file else choice
+
+
+_OWN = ("part", "mode", "filename", "shape", "to_world", "face_normals", "flip_normals", "silent")
+"""Properties of a region that are none of its shape's: ours, and those that Mitsuba gives every shape."""
+
+
+def _plain(value: Any) -> Any:
+    """A number, text, or a list of numbers for a vector."""
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    try:
+        return np.array(value, dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        return str(value)
 
 
 def _focal_region(mi: Any, properties: Any) -> Any:
-    # Mitsuba's own names: `part` and `mode` are ours, `filename` and `to_world` mean what they mean for a `ply`.
-    properties.get("part", DEFAULT_PART_NAME)
-    properties.get("mode", ADD)
-    filename = properties.get("filename", None)
-    to_world = np.array(properties.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
-    vertices, faces = region_triangles(mi, filename, to_world)
+    links = (mi.Properties.Type.Reference, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Object)
+    # Reading a property tells Mitsuba that it is known.
+    known = {name: properties[name] for name in properties.keys() if properties.type(name) not in links}
+    transform = known.get("to_world", mi.ScalarTransform4f())
+    vertices, faces = region_triangles(mi, known, np.array(transform.matrix, dtype=np.float64))
     if not properties.objects():
         # Without a BSDF of its own a region is glassy, so that a plain render of the scene shows what it encloses.
         glassy = {"type": "mask", "opacity": 0.25, "nested": {"type": "twosided", "bsdf": {"type": "diffuse"}}}

@@ -74,7 +74,7 @@ def _reaches(region: FocalRegion, points: np.ndarray, mesh: TriangleMesh) -> boo
     """Whether a part of that region can touch the mesh, whose canonical vertices are `points`."""
     if float(region.sdf(points).max()) > -_REACH:
         return True
-    return float(MeshDistance(points, mesh.faces).unsigned(region.surface(3).vertices).min()) < _REACH
+    return float(MeshDistance(points, mesh.faces).unsigned(region.surface_points()).min()) < _REACH
 
 
 def _check_solid(element: SceneElement, mesh: TriangleMesh) -> None:

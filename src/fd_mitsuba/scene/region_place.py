@@ -65,7 +65,7 @@ def gap_to_base(region: FocalRegion, distance: MeshDistance, base: TriangleMesh)
         distance: of the base in the canonical frame.
         base: the same base in the canonical frame; its vertices are tested against the region too.
     """
-    surface = region.surface(3).vertices
+    surface = region.surface_points()
     if distance.inside(surface).any():
         return 0.0
     to_surface = float(distance.unsigned(surface).min())

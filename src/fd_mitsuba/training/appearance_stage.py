@@ -20,22 +20,21 @@ from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
 from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
-from fd_mitsuba.losses.bend import loss_bend
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.part_shading import PartShading
 from fd_mitsuba.render.tonemap import CLAY_LEVEL, auto_exposure, to_linear, to_srgb
-from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
-from fd_mitsuba.training.style_consistency import StyleConsistency, learn_base_material
 from fd_mitsuba.training.surface_points import points_on
 from fd_mitsuba.viewing.sheets import appearance_sheet
 
@@ -92,7 +91,7 @@ class AppearanceStage:
         self.aim = centre_of_box(np.concatenate([scene.base_canonical.vertices, corners]))
         self.exposure = settings.exposure or self._exposure()
         self._points = points_on(self.parts.values(), _POOL, seed_for(config.seed, Purpose.STYLE))
-        self.style = self._style(say)
+        self.losses = self._losses(say)
 
     def phase_name(self, step: int) -> str:
         """The name that the progress line shows."""
@@ -144,16 +143,8 @@ class AppearanceStage:
             result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
             losses["sds"], preview = result.loss, result.preview
             values.update(result.logs)
-        if self.style is not None:
-            losses.update(self.style.losses(self.field, step))
-        if settings.lambda_bend > 0 and "normal" in self.material.learned:
-            losses["bend"] = loss_bend(texture.normal)
-        weights = {
-            "sds": settings.lambda_sds,
-            "bend": settings.lambda_bend,
-            "style_gradient": settings.lambda_style,
-            "style_boundary": settings.lambda_style * settings.lambda_boundary,
-        }
+        losses.update(self.losses(texture, gbuffer, self.field, step))
+        weights = {"sds": settings.lambda_sds, **self.losses.weights}
         values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
         shown = _detached(pictures), _without_gradient(texture)
         return StepRecord(values, partial(appearance_sheet, gbuffer, *shown, self.exposure, preview))
@@ -208,17 +199,13 @@ class AppearanceStage:
         clay_part = self.rendering.render_clay(gbuffer, seed)
         return self._finished(clay_part + pictures.base_path, gbuffer, step)
 
-    def _style(self, say: Callable[[str], None]) -> StyleConsistency | None:
+    def _losses(self, say: Callable[[str], None]) -> AppearanceLosses:
         settings, seed = self.config.appearance, self.config.seed
-        if not (settings.style or settings.single_path):
-            return None
-        base = BaseAppearance(self.scene)
-        for remark in base.unreadable:
-            say(remark)
+        surface = PartSurface(self.scene, self._points, self.material.learned, seed, say)
         if settings.single_path:
             points = points_on([self.scene.base_canonical], _POOL, seed_for(seed, Purpose.BASE_MATERIAL))
-            learn_base_material(self.field, base, points, settings.learning_rate, _INITIAL_STEPS, seed)
-        return StyleConsistency(base, self._points, settings, seed, say) if settings.style else None
+            learn_base_material(self.field, surface.base, points, settings.learning_rate, _INITIAL_STEPS, seed)
+        return AppearanceLosses(self.config, surface)
 
     def _exposure(self) -> float:
         """By the light alone: the base in clay under it, so that a dark base does not make a white part glare."""

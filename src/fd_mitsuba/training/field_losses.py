@@ -1,21 +1,21 @@
-"""The geometry stage's losses on the part's field itself, apart from every picture: L_GF, L_CA and three additions.
+"""Where a step of the geometry stage asks the part's field, and what the losses of `geometry_losses` make of it.
 
 Each is a mean over samples at the grid's vertices; a weight of 0 turns its work off.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.sections import GeometryConfig
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.extraction.surface import Samples
 from fd_mitsuba.extraction.tet_grid import TetGrid
-from fd_mitsuba.losses.collision import loss_collision
-from fd_mitsuba.losses.focal import loss_focal
-from fd_mitsuba.losses.presence import loss_presence
-from fd_mitsuba.losses.tether import loss_tether
+from fd_mitsuba.training.geometry_losses import GEOMETRY_LOSSES, FieldLoss, FieldPlace, FieldSamples, built_in_losses
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.tethers import THIN, Tethers
 
@@ -24,7 +24,7 @@ RIM_IN_CELLS = 2.0
 
 
 class FieldLosses:
-    """Where a step asks the field, and what the answers cost.
+    """The losses of a stage.
 
     Args:
         config: weights and settings, of its section `geometry`.
@@ -47,28 +47,46 @@ class FieldLosses:
         active_index: Tensor,
         subtracts: bool,
     ) -> None:
-        self._geometry, self._seed, self._spacing = config.geometry, config.seed, grid.spacing
-        self._sdf_base, self._region_sdf, self._active = sdf_base, region_sdfs.amax(dim=0), active_index
+        self._geometry, self._seed, self._active = config.geometry, config.seed, active_index
         self.room = region_sdfs > 0
         if not subtracts:
             outside = self.room & (sdf_base < 0)
             self.room = torch.cat([outside, outside & (sdf_base > -RIM_IN_CELLS * grid.spacing)])
-        self._lambda_collision = 0.0 if subtracts else self._geometry.lambda_collision
+        region_sdf = region_sdfs.amax(dim=0)
+        self._place = FieldPlace(grid.vertices, sdf_base, region_sdf, self.room, grid.spacing, subtracts, config.seed)
         self._tethers: Tethers | None = None
         if tether_depth(self._geometry, grid, subtracts) is not None:
-            within = self._region_sdf > -self._geometry.focal_band
+            within = region_sdf > -self._geometry.focal_band
             self._tethers = Tethers(grid, sdf_base, within, active_index)
+
+    @cached_property
+    def _losses(self) -> dict[str, tuple[float, FieldLoss]]:
+        """Weight and loss by name. Made when first asked for: an export needs none, nor the modules that have them."""
+        geometry = self._geometry
+        wanted = {name: (*entry, f"geometry.lambda_{name}") for name, entry in built_in_losses(geometry).items()}
+        for name, loss in geometry.losses.items():
+            wanted[name] = loss.weight, loss.choice(name), f"geometry.losses.{name}"
+        made = {
+            name: (weight, GEOMETRY_LOSSES.make(choice, key))
+            for name, (weight, choice, key) in wanted.items()
+            if weight > 0
+        }
+        return {name: found for name, found in made.items() if found[1].in_cuts or not self._place.subtracts}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Those of the losses that count."""
+        return {name: weight for name, (weight, _) in self._losses.items()}
 
     def draw(self, step: int) -> Tensor | None:
         """The step's vertices (S,) int64, random by (seed, step); None if no loss looks at any."""
-        geometry = self._geometry
-        additions = (geometry.lambda_volume, geometry.lambda_presence, self._tethers is not None)
-        if not any((geometry.lambda_focal, self._lambda_collision, *additions)):
+        if not self._losses:
             return None
-        if len(self._active) <= geometry.focal_samples:
+        count = self._geometry.focal_samples
+        if len(self._active) <= count:
             return self._active
         generator = torch.Generator().manual_seed(seed_for(self._seed, Purpose.SAMPLES, step))
-        return self._active[torch.randint(len(self._active), (geometry.focal_samples,), generator=generator)]
+        return self._active[torch.randint(len(self._active), (count,), generator=generator)]
 
     def with_tethers(self, samples: Tensor | None) -> Samples | None:
         """`draw`'s samples, and after them the vertices between the object and loose pieces where their loss counts."""
@@ -77,36 +95,29 @@ class FieldLosses:
             return samples
         return lambda deeper: torch.cat([samples, tethers.find(deeper)])
 
-    def __call__(self, sdf_part: Tensor, samples: Tensor) -> dict[str, Tensor]:
-        """The losses by the names of their weights, without the weights; gradients flow to `sdf_part`.
+    def __call__(self, sdf_part: Tensor, samples: Tensor, step: int = 0) -> dict[str, Tensor]:
+        """The losses by their names, without the weights; gradients flow to `sdf_part`.
 
         Args:
             sdf_part: (S + T,) the field at `with_tethers(samples)`, inside positive, canonical units.
             samples: (S,) what `draw` gave.
+
+        Raises:
+            UserError: a loss of another module is no number.
         """
-        geometry, losses = self._geometry, {}
         sdf, at_tethers = sdf_part[: len(samples)], sdf_part[len(samples) :]
-        region = self._region_sdf[samples]
-        if geometry.lambda_focal > 0:
-            outside = region < 0
-            distance = (-region[outside] - geometry.focal_band).clamp(min=0)
-            losses["focal"] = loss_focal(
-                sdf[outside],
-                distance,
-                geometry.focal_sigma_distance,
-                geometry.focal_sigma_sdf,
-                geometry.focal_margin,
-            )
-        if self._lambda_collision > 0:
-            losses["collision"] = loss_collision(self._sdf_base[samples], sdf)
-        if geometry.lambda_volume > 0:
-            losses["volume"] = (0.5 + sdf / (2 * self._spacing)).clamp(0, 1).mean()
-        if geometry.lambda_presence > 0:
-            depth = 0.5 * self._spacing
-            losses["presence"] = loss_presence(sdf, self.room[:, samples], geometry.presence_share, depth)
-        if self._tethers is not None:
-            losses["tether"] = loss_tether(at_tethers, self._spacing)
+        at = FieldSamples(sdf, samples, at_tethers, self._place, step)
+        losses = {name: loss(at) for name, (_, loss) in self._losses.items()}
+        check_scalars(losses, "geometry")
         return losses
+
+
+def check_scalars(losses: dict[str, Tensor], section: str) -> None:
+    """UserError where what a loss gave cannot be added up."""
+    for name, loss in losses.items():
+        if not isinstance(loss, Tensor) or loss.dim():
+            got = f"a tensor of shape {tuple(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
+            raise UserError(f"{section}.losses.{name}: gives {got}, not a scalar tensor; mend its module")
 
 
 def tether_depth(geometry: GeometryConfig, grid: TetGrid, subtracts: bool) -> float | None:

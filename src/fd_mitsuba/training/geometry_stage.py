@@ -55,7 +55,7 @@ class GeometryStage:
         trained_in = guidance.normal_space if guidance is not None else None
         if trained_in not in (None, geometry.normal_space):
             raise UserError(
-                f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.model} was trained with normals "
+                f"geometry.normal_space = {geometry.normal_space!r}: {config.guidance.source} was trained with normals "
                 f"in {trained_in} space; set geometry.normal_space={trained_in}"
             )
         check_views(self.name, config, guidance)
@@ -147,8 +147,8 @@ class GeometryStage:
             values.update(result.logs)
             self._watch_visibility(pictures)
         if samples is not None:
-            losses.update(self.field_losses(surface.sample_sdf, samples))
-        weights = {name: getattr(geometry, f"lambda_{name}") for name in losses}
+            losses.update(self.field_losses(surface.sample_sdf, samples, step))
+        weights = {"sds": geometry.lambda_sds, **self.field_losses.weights}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
         values["part_faces"] = float(surface.face_is_part.sum())

@@ -26,6 +26,7 @@ class Purpose(IntEnum):
     BASE_MATERIAL = 13
     STYLE_JITTER = 14
     START = 15
+    LOSSES = 16
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:

@@ -27,7 +27,7 @@ def check_views(stage: str, config: RunConfig, guidance: SeesMosaics | None) -> 
     views, mosaic = getattr(config, stage).views, views_at_once(guidance)
     if views % mosaic:
         raise UserError(
-            f"{stage}.views = {views}: {config.guidance.model} sees {mosaic} views at once; "
+            f"{stage}.views = {views}: {config.guidance.source} sees {mosaic} views at once; "
             f"set {stage}.views to a multiple of {mosaic}"
         )
 
