@@ -65,6 +65,8 @@ USAGE = {
     "threads that are no number": ["run", "scene.xml", "-t", "many"],
     "option without its value": ["run", "scene.xml", "-o"],
     "two scenes": ["check", "a.xml", "b.xml"],
+    "threads of thousands of digits": ["run", "scene.xml", "-t", "9" * 5000],
+    "a seed of thousands of digits": ["batch", "scene.xml", "-o", "out", "--seeds", "9" * 5000],
 }
 
 
@@ -90,6 +92,10 @@ OPTIONS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "scalar variant": (["-m", "scalar_rgb"], ("scalar_rgb", "llvm_ad_rgb")),
     "unknown variant": (["-m", "llvm_rbg"], ("llvm_rbg", "choose one of")),
     "negative threads": (["-t", "-2"], ("-t -2", "0 (all cores)")),
+    "threads without end": (["-t", "100000"], ("-t 100000", "at most")),
+    "samples without end": (["--set", "appearance.spp=1000000000"], ("appearance.spp", "less than or equal to 4096")),
+    "weight without end": (["--set", "geometry.lambda_focal=1e300"], ("lambda_focal", "less than or equal to")),
+    "seed of thousands of digits": (["--set", "seed=" + "9" * 5000], ("--set seed=9", "equal to 2147483647")),
     "blank prompt": (["--prompt", "  "], ("--prompt", "blank")),
     "empty prompt": (["--prompt", ""], ("--prompt", "blank")),
     "model that is nowhere": (["--set", "guidance.model=./none"], ("./none", "guidance.model")),
@@ -195,6 +201,26 @@ def test_output_folder_of_something_else(
     code, line = call(capfd, *run(scene, tmp_path / "out", *resume))
     assert code == 1 and "not empty and not a run" in line
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+NUMBERS: dict[str, tuple[list[str], str]] = {
+    "batch --workers": (["batch", "SCENE", "-o", "OUT", "--workers", "1000000000"], "at most 1024"),
+    "batch --seeds": (["batch", "SCENE", "-o", "OUT", "--seeds", "99999999999"], "less than or equal to 2147483647"),
+    "batch -t": (["batch", "SCENE", "-o", "OUT", "-t", "100000"], "give 1 to"),
+    "evaluate --views": (["evaluate", "OUT", "--views", "1000000000"], "at most 10000"),
+    "evaluate --spp": (["evaluate", "OUT", "--spp", "1000000000"], "at most 10000, 2048 and 4096"),
+    "render --size": (["render", "OUT", "--size", "1000000"], "at most 1000, 4096"),
+    "render samples": (["render", "OUT", "--size", "4096", "--spp", "65536"], "more than Dr.Jit can number"),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_without_end(name: str, scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words, said = NUMBERS[name]
+    places = {"SCENE": str(scene), "OUT": str(tmp_path / "out")}
+    code, line = call(capfd, *[places.get(word, word) for word in words])
+    assert code == 1 and said in line and words[-2].strip("-").rstrip("s") in line
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "null"])
