@@ -26,7 +26,7 @@ from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.export.solid.part_solid import part_solid
+from fd_mitsuba.export.final_surface.final_part import final_part
 from fd_mitsuba.io.atomic import is_litter
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage
 from fd_mitsuba.scene.edit_scene import load_edit_scene
@@ -221,7 +221,7 @@ def test_finished_stage_can_be_loaded(finished: Path, place: Path) -> None:
     config = RunConfig.load(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
     stage = load_finished_stage(scene, config, finished)
     metrics = json.loads((finished / "metrics.json").read_text())
-    assert len(part_solid(stage, "part").faces) == metrics["part_faces"]["part"]
+    assert len(final_part(stage, "part", config.output.faces).solid.faces) == metrics["part_faces"]["part"]
 
 
 def test_interrupted_and_resumed_gives_the_same_bytes(finished: Path, place: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.export.solid.part_solid import part_solid
+from fd_mitsuba.evaluation.surface_quality import smallest_angles
+from fd_mitsuba.export.final_surface.final_part import final_part
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.triangle_mesh import topology
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -34,7 +35,10 @@ def test_shipped_scene(path: Path) -> None:
         assert (piece.status() == manifold3d.Error.NoError) == closed
         whole = whole + piece if closed and whole is not None else None
     for name in scene.parts:
-        solid = part_solid(stage, name)
+        final = final_part(stage, name, 20_000)
+        solid = final.solid
+        assert np.percentile(smallest_angles(solid.vertices, solid.faces), 5) > 25
+        assert final.distance.mean() < 0.02 * stage.grid.spacing
         mesh = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
         assert solid.manifold and mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
         assert solid.gap(scene.base_canonical) == 0.0 and solid.islands_removed == 0

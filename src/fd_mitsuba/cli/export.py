@@ -22,7 +22,7 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
         metavar="FORMAT",
         help="any of glb obj ply mitsuba, or what a plugin registers; default: those four",
     )
-    export.add_argument("--faces", type=int, metavar="N", help="at most so many triangles a part; default: all")
+    export.add_argument("--faces", type=int, metavar="N", help="at most so many triangles a part; default: the run's")
     export.add_argument("--texture-size", type=int, default=1024, metavar="N", help="texels a side; default: 1024")
     machine_options(export)
     export.add_argument("--json", action="store_true", help="machine-readable")

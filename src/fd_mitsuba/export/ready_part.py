@@ -28,11 +28,13 @@ class PartAsset:
         vertices: (V, 3), user frame.
         faces: (F, 3), a closed solid, or the faces of a cut.
         values: the learned material; None: the constants of the scene's `<bsdf id="part">`.
+        normals: (V, 3) unit shading normals; None: the smooth ones of the faces.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     values: Field | None = None
+    normals: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def ready_part(
 
     Writes the latter into `textures/` of the folder, as PNG and EXR.
     """
-    mesh = unwrap(part.vertices, part.faces, texture_size)
+    mesh = unwrap(part.vertices, part.faces, texture_size, part.normals)
     file, element = inputs.part_bsdf()
     plain = PbrMaterial(label) if element is None else pbr_material(file, element, label)
     if part.values is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from fd_mitsuba import __version__
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.cut_shapes import CutBase, cut_base
+from fd_mitsuba.export.final_surface.final_part import FinalPart
 from fd_mitsuba.export.meshes import copy_base, write_mesh
 from fd_mitsuba.export.part_record import part_file, part_record
 from fd_mitsuba.export.solid.part_solid import part_solid
@@ -103,12 +104,16 @@ def load_finished_stage(scene: EditScene, config: RunConfig, folder: Path) -> Ge
     return stage
 
 
-def export_geometry(stage: GeometryStage, folder: Path) -> dict:
-    """Write meshes, turntable and contact sheet of the stage's present state; returns the measured metrics."""
+def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, FinalPart]) -> dict:
+    """Write meshes, turntable and contact sheet of the stage's present state; returns the measured metrics.
+
+    Args:
+        finished: the final surface of every part, see `final_parts`.
+    """
     scene, config, export = stage.scene, stage.config, folder / "export"
     with torch.no_grad():
         union = stage.surface()
-    parts = {name: part_solid(stage, name) for name in scene.parts}
+    parts = {name: part.solid for name, part in finished.items()}
     figures: dict[str, Any] = {}
     opened = cut = None
     if scene.subtracts:
@@ -129,6 +134,7 @@ def export_geometry(stage: GeometryStage, folder: Path) -> dict:
     grown = tuple(tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
     base = scene.base_canonical
     locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
+    # Parts may join the base through each other, so that their gaps are those of all together.
     whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage, None)
     _write_turntable(stage, whole, cut, folder)
     return {

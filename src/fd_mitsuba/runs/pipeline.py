@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 from fd_mitsuba.backend.peak_memory import peak_memory_mb
 from fd_mitsuba.backend.threads import rendering_threads
@@ -13,10 +15,9 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, chosen_exporters, export_assets
+from fd_mitsuba.export.final_surface.final_part import FinalPart, final_parts
 from fd_mitsuba.export.part_record import part_record
-from fd_mitsuba.export.solid.decimation import decimated
-from fd_mitsuba.export.solid.part_solid import part_solid
-from fd_mitsuba.export.solid.solid import LEAST_FACES, Solid
+from fd_mitsuba.export.solid.solid import LEAST_FACES
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.io.json_object import write_json
@@ -175,7 +176,8 @@ def _run(
         geometry = load_finished_stage(scene, config, folder)
         begin()
     with rendering_threads():
-        metrics = export_geometry(geometry, folder)
+        finished = final_parts(geometry, config.output.faces, say)
+        metrics = export_geometry(geometry, folder, finished)
     if guidance is not None:
         metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
     verdict = None
@@ -202,7 +204,7 @@ def _run(
         write_metrics()
     if with_assets:
         with rendering_threads():
-            write_assets(geometry, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+            write_assets(geometry, finished, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
     metrics["warnings"] = outcome_warnings(metrics)
     # Written last of all: a folder without it is not finished.
     done = {"geometry", *stages}
@@ -223,7 +225,7 @@ def export_run(
     """Write the assets of a run, finished or interrupted, as of its newest checkpoint; see `export.assets`.
 
     Args:
-        faces: at most so many triangles a part; None: all.
+        faces: at most so many triangles a part; None: as many as in the run's settings.
 
     Raises:
         UserError: no run or no checkpoint there, and see `export.assets.export_assets`.
@@ -236,11 +238,13 @@ def export_run(
         geometry = load_finished_stage(scene, config, folder)
         appearance = finished_appearance(scene, config, folder)
         field = None if appearance is None else appearance.field
-        return write_assets(geometry, field, folder, formats, texture_size, say, faces)
+        finished = final_parts(geometry, max(faces or 0, config.output.faces), say)
+        return write_assets(geometry, finished, field, folder, formats, texture_size, say, faces)
 
 
 def write_assets(
     geometry: GeometryStage,
+    finished: Mapping[str, FinalPart],
     field: TextureField | None,
     folder: Path,
     formats: Collection[str | Choice],
@@ -251,29 +255,34 @@ def write_assets(
     """Write the assets of the stages' present state below `folder`; returns what `export.assets` says of them.
 
     Args:
+        finished: the final surface of every part, see `final_parts`.
         field: the parts' learned material; None: the constants of the scene's part BSDF.
-        faces: at most so many triangles a part; None: all.
+        faces: at most so many triangles a part; None: all that there are.
     """
     scene = geometry.scene
-    solids = {name: part_solid(geometry, name) for name in scene.parts}
     if faces is not None:
-        solids = {name: _within_budget(name, solid, faces, say) for name, solid in solids.items()}
+        finished = {name: _within_budget(name, part, faces, say) for name, part in finished.items()}
+    solids = {name: part.solid for name, part in finished.items()}
+    normals: dict[str, np.ndarray | None] = {name: part.normals for name, part in finished.items()}
     cut = cut_out(scene, solids) if scene.subtracts else None
     if cut is not None:
-        solids = removed_parts(scene, cut)
-    parts = {name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field) for name, solid in solids.items()}
+        solids, normals = removed_parts(scene, cut), {}
+    parts = {
+        name: PartAsset(scene.frame.to_user(solid.vertices), solid.faces, field, normals.get(name))
+        for name, solid in solids.items()
+    }
     opened = None if cut is None else cut.names(opened=True)
     write_json(folder / "export" / "part.json", part_record(scene, solids, opened))
     export = folder / "export"
     return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
 
 
-def _within_budget(name: str, solid: Solid, faces: int, say: Callable[[str], None]) -> Solid:
+def _within_budget(name: str, part: FinalPart, faces: int, say: Callable[[str], None]) -> FinalPart:
     """The part with at most `faces` faces; `say` hears where the shape needs more, or has suffered."""
-    small = decimated(solid, faces)
-    kept = small.volume / solid.volume if solid.volume > 0 else 1.0
-    if len(small.faces) > faces:
-        say(f"--faces {faces}: part {name!r} keeps {len(small.faces)} faces; with fewer it would fall apart")
+    small, volume = part.decimated(faces), part.solid.volume
+    kept = small.solid.volume / volume if volume > 0 else 1.0
+    if len(small.solid.faces) > faces:
+        say(f"--faces {faces}: part {name!r} keeps {len(small.solid.faces)} faces; with fewer it would fall apart")
     elif abs(kept - 1) > _VOLUME_CHANGE_SAID:
         say(f"--faces {faces}: part {name!r} has {kept:.0%} of its volume left; allow more faces for a truer shape")
     return small

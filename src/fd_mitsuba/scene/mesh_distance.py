@@ -57,6 +57,15 @@ class MeshDistance:
             )
         return face, _corner_weights(self._vertices[self._faces[face]], foot)
 
+    def feet(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) float64 the nearest point of the mesh to each of `points` (N, 3)."""
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        foot = np.empty((len(points), 3))
+        for start in range(0, len(points), _CHUNK):
+            part = points[start : start + _CHUNK]
+            foot[start : start + _CHUNK] = self._tree.squared_distance(self._vertices, self._faces, part)[2]
+        return foot
+
     def winding_number(self, points: np.ndarray) -> np.ndarray:
         """(N,) float64 generalised winding number: 1 inside a closed outward mesh, 0 outside, between for open ones."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)

@@ -36,14 +36,14 @@ def open_notches(
     """
     left = int(_MOST * len(faces))
     for _ in range(_ROUNDS):
-        crowded = _crowded(vertices[vertex_map], faces, flat, density)[:left]
-        if not len(crowded):
+        narrow = crowded(vertices[vertex_map], faces, flat, density)[:left]
+        if not len(narrow):
             break
-        left -= len(crowded)
-        fresh = faces[crowded].reshape(-1)
-        apart = _in_a_row(flat[faces[crowded]], flat.max(axis=0) + 1 / density)
+        left -= len(narrow)
+        fresh = faces[narrow].reshape(-1)
+        apart = _in_a_row(flat[faces[narrow]], flat.max(axis=0) + 1 / density)
         faces = faces.copy()
-        faces[crowded] = len(flat) + np.arange(len(fresh)).reshape(-1, 3)
+        faces[narrow] = len(flat) + np.arange(len(fresh)).reshape(-1, 3)
         vertex_map, flat = np.concatenate([vertex_map, vertex_map[fresh]]), np.concatenate([flat, apart.reshape(-1, 2)])
         used, faces = np.unique(faces, return_inverse=True)
         faces, vertex_map, flat = faces.reshape(-1, 3), vertex_map[used], flat[used]
@@ -65,8 +65,8 @@ def charts_of(faces: np.ndarray, count: int) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _crowded(points: np.ndarray, faces: np.ndarray, flat: np.ndarray, density: float) -> np.ndarray:
-    """Faces at one side of each place that is too narrow, the worst first."""
+def crowded(points: np.ndarray, faces: np.ndarray, flat: np.ndarray, density: float) -> np.ndarray:
+    """Faces at one side of each place that is too narrow, the worst first; arguments as those of `open_notches`."""
     owner, places, where = _edge_samples(points, faces, flat, density)
     pairs = cKDTree(places).query_pairs(_NEAR, output_type="ndarray")
     chart = charts_of(faces, len(flat))[faces[:, 0]][owner]

@@ -8,11 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 import xatlas
 
-from fd_mitsuba.export.bake.chart_notches import charts_of, open_notches
+from fd_mitsuba.export.bake.chart_growth import grown_charts, split_chart
+from fd_mitsuba.export.bake.chart_notches import charts_of, crowded, open_notches
+from fd_mitsuba.export.bake.chart_packing import packed_charts
+from fd_mitsuba.export.bake.flatten import flattened
 from fd_mitsuba.export.bake.tangents import vertex_normals
+from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 
 _FACES_AT_ONCE = 2500
 """xatlas grows charts in more than linear time: pieces of this size are quicker, and give fewer charts."""
+_FEWEST = 400
+"""Faces that a mesh must have for charts of our own."""
+_ROUNDS, _TRIES = 3, 40
+"""How often charts with narrow notches are cut in two, and how many may not lie flat before all is left to xatlas."""
+_FEW_CHARTS = 100
+"""So many charts are laid one by one; more would take too long."""
 _PACKINGS = 6
 _LONGEST = 1000.0
 """The size that xatlas sees: it takes triangles below 1e-7 in area for nothing, which slivers of a unit mesh are."""
@@ -25,7 +35,7 @@ class UnwrappedMesh:
     Attributes:
         vertices: (V, 3) float64, in the frame of the input.
         faces: (F, 3) int64.
-        normals: (V, 3) float64 unit, smooth over the whole input: equal on both sides of a seam.
+        normals: (V, 3) float64 unit, equal on both sides of a seam.
         uv: (V, 2) float64 in [0, 1], origin in the picture's top left corner and v downwards, as in glTF and Mitsuba.
             A chart seen in the picture is as seen from outside, never mirrored.
         vertex_map: (V,) int64, the input vertex that each vertex comes from.
@@ -43,26 +53,90 @@ def padding_for(texture_size: int) -> int:
     return max(2, texture_size // 128)
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, texture_size: int) -> UnwrappedMesh:
+def unwrap(
+    vertices: np.ndarray, faces: np.ndarray, texture_size: int, normals: np.ndarray | None = None
+) -> UnwrappedMesh:
     """The atlas of a mesh, vertices (V, 3) and faces (F, 3), for a square texture of `texture_size` texels a side.
 
     The same input gives the same atlas.
+
+    Args:
+        normals: (V, 3) unit; None: those of the faces around each vertex.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(faces, dtype=np.int64)
-    vertex_map, split, flat = _charts(vertices, faces)
+    vertex_map, split, flat = _charts(vertices, faces, texture_size)
     density = _likely_density(flat, split, texture_size)
     vertex_map, split, flat = open_notches(vertices, vertex_map, split, flat, density)
     uv = _packed(flat, split, texture_size)
     vertex_map, split, uv = place_left_out(vertices, vertex_map, split, uv)
     uv[:, 1] = 1.0 - uv[:, 1]  # xatlas has v upwards
-    return UnwrappedMesh(
-        vertices[vertex_map], split, vertex_normals(vertices, faces)[vertex_map], np.clip(uv, 0, 1), vertex_map
-    )
+    if normals is None:
+        normals = vertex_normals(vertices, faces)
+    return UnwrappedMesh(vertices[vertex_map], split, normals[vertex_map], np.clip(uv, 0, 1), vertex_map)
 
 
-def _charts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertex map, split faces, and a place (V, 2) of each split vertex in the vertices' unit; charts do not overlap."""
+def _charts(vertices: np.ndarray, faces: np.ndarray, texture_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertex map, split faces, and a place (V, 2) of each split vertex in the vertices' unit; charts do not overlap.
+
+    Few, wide charts where the surface is closed and even enough for that; else xatlas's.
+    """
+    return _wide_charts(vertices, faces, texture_size) or _xatlas_charts(vertices, faces)
+
+
+def _wide_charts(
+    vertices: np.ndarray, faces: np.ndarray, texture_size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    if len(faces) < _FEWEST:
+        return None
+    try:
+        edges = edges_of(faces, len(vertices))
+    except ValueError:
+        return None
+    chart = grown_charts(vertices, faces, edges)
+    laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # its faces, their vertices, places
+    tries = 0
+    for _ in range(_ROUNDS):
+        waiting = [number for number in np.unique(chart).tolist() if number not in laid]
+        while waiting:
+            number = waiting.pop()
+            own = np.flatnonzero(chart == number)
+            used, local = np.unique(faces[own], return_inverse=True)
+            flat = flattened(vertices[used], local.reshape(-1, 3))
+            if flat is not None:
+                laid[number] = own, used, flat
+                continue
+            tries += 1
+            if tries > _TRIES or len(own) < 2:
+                return None
+            fresh = int(chart.max()) + 1
+            chart = split_chart(vertices, faces, edges, chart, number)
+            waiting += [number, fresh]
+        vertex_map, split, flat = _side_by_side(faces, laid)
+        narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
+        for number in np.unique(chart[narrow]).tolist():
+            chart = split_chart(vertices, faces, edges, chart, number)
+            del laid[number]
+        if not len(narrow):
+            break
+    return vertex_map, split, flat
+
+
+def _side_by_side(
+    faces: np.ndarray, laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertex map, split faces and places of charts, none of which overlaps another."""
+    split, vertex_map, places, count, corner = np.empty_like(faces), [], [], 0, 0.0
+    for own, used, flat in laid.values():
+        split[own] = np.searchsorted(used, faces[own]) + count
+        vertex_map.append(used)
+        places.append(flat - flat.min(axis=0) + [corner, 0.0])
+        corner += float(np.ptp(flat[:, 0])) * 1.1
+        count += len(used)
+    return np.concatenate(vertex_map), split, np.concatenate(places)
+
+
+def _xatlas_charts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     centred = vertices - vertices.mean(axis=0)  # xatlas works in float32
     longest = float(np.abs(centred).max()) or 1.0
     atlas = xatlas.Atlas()
@@ -146,8 +220,15 @@ def _pieces(centres: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
 def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarray:
     """The charts packed into the unit square, as large as they fit with the gutter that the texture needs.
 
-    xatlas itself only comes near a wanted size, and the gutter would shrink with the rest.
+    Few charts are laid one by one. With more, xatlas packs them; it only comes near a wanted size, and the gutter would
+    shrink with the rest.
     """
+    chart = charts_of(faces, len(flat))
+    left_out = np.all(flat[faces] == 0, axis=(1, 2)).any()  # see `place_left_out`
+    if chart.max() < _FEW_CHARTS and not left_out:
+        laid = packed_charts(flat, faces, chart, texture_size, padding_for(texture_size))
+        if laid is not None:
+            return laid
     density = _likely_density(flat, faces, texture_size)
     best, best_density, upper = None, 0.0, np.inf
     for _ in range(_PACKINGS):

@@ -6,6 +6,7 @@ Vertices are connected along the grid's edges, so pieces here are exactly those 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,38 +23,59 @@ BRIDGE_REACH = 0.1
 """The part swells by at most this, canonical units, to reach the base; what stays farther away is meant to float."""
 
 
-def keep_large(grid: TetGrid, inside: Tensor, sdf_part: Tensor, owner: Tensor) -> tuple[Tensor, list[int]]:
-    """`inside` (count,) without stray islands, and how many islands each named part lost.
+@dataclass(frozen=True)
+class Bridge:
+    """A piece that swells to reach the base; see `bridge_gaps`.
+
+    Attributes:
+        gap: what was between them, canonical units.
+        swelling: by how much the piece grows at most, canonical units.
+        own: (z, y, x) bool, the vertices of the grid that are nearer to this piece than to any other.
+    """
+
+    gap: float
+    swelling: float
+    own: np.ndarray
+
+
+def bridge_weight(sdf_base: Tensor, bridge: Bridge) -> Tensor:
+    """The share (N,) of the swelling that a point takes part in: all of it up to the gap's width from the base."""
+    return ((bridge.gap + 2 * bridge.swelling + sdf_base) / (2 * bridge.swelling)).clamp(0, 1)
+
+
+def keep_large(inside: np.ndarray, volume: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """`inside` (z, y, x) without stray islands, and how many islands each named part lost.
 
     A piece counts by the volume of the part in it: what is fillet only has none, goes too, and is not counted.
 
     Args:
-        inside: (count,) bool.
-        sdf_part: (count,) inside positive, canonical units.
-        owner: (count,) number of the named part that a vertex belongs to.
+        inside: (z, y, x) bool.
+        volume: (z, y, x) how much of the part is around a vertex.
+        owner: (z, y, x) number of the named part that a vertex belongs to.
     """
-    label, count = _label(grid, inside)
-    shares = _part_shares(grid, label, count, sdf_part, owner)
+    label, count = label_pieces(inside)
+    shares = _part_shares(label, count, volume, owner)
     stray = shares.max(axis=0) < ISLAND_SHARE
     stray[0] = True
     removed = [int(((shares.argmax(axis=0) == i) & stray & (shares[i] > 0))[1:].sum()) for i in range(len(shares))]
-    return inside & torch.from_numpy(~stray[label]).view(-1), removed
+    return inside & ~stray[label], removed
 
 
-def fill_pockets(grid: TetGrid, inside: Tensor, fillable: Tensor) -> Tensor:
-    """`inside` (count,) with every enclosed void filled that is `fillable` (count,) throughout."""
-    label, count = _label(grid, ~inside)
-    border = grid.is_border(torch.arange(grid.count)).numpy()
+def fill_pockets(inside: np.ndarray, fillable: np.ndarray) -> np.ndarray:
+    """`inside` (z, y, x) with every enclosed void filled that is `fillable` throughout."""
+    label, count = label_pieces(~inside)
+    border = np.ones(label.shape, dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
     keep = np.zeros(count + 1, dtype=bool)
-    keep[label.reshape(-1)[border | ~fillable.numpy()]] = True
+    keep[label[border | ~fillable]] = True
     keep[0] = True
-    return inside | torch.from_numpy(~keep[label]).view(-1)
+    return inside | ~keep[label]
 
 
 def bridge_gaps(
     grid: TetGrid, sdf_base: Tensor, sdf_part: Tensor, owner: Tensor, inside_of: Callable[[Tensor], Tensor]
-) -> tuple[Tensor, float]:
-    """`sdf_part` (count,) swollen towards the base where a piece ends just before it, and by how much at most.
+) -> tuple[Tensor, list[Bridge]]:
+    """`sdf_part` (count,) swollen towards the base where a piece ends just before it, and how it was done.
 
     A piece is joined to the base if it has a vertex inside it. One that is not, though it is large, swells near its
     end: with gap g to the base and swelling a, its signed distance grows by a clamp((g + 2 a + sdf_base) / 2 a, 0, 1),
@@ -66,13 +88,15 @@ def bridge_gaps(
     """
     inside = inside_of(sdf_part)
     label, count = _label(grid, inside)
-    large = _part_shares(grid, label, count, sdf_part, owner).max(axis=0) >= ISLAND_SHARE
+    owners = owner.view(label.shape).numpy()
+    large = _part_shares(label, count, part_volume(grid, sdf_part), owners).max(axis=0) >= ISLAND_SHARE
     floating = [piece for piece in range(1, count + 1) if large[piece] and not _joined(label == piece, sdf_base)]
     if not floating:
-        return sdf_part, 0.0
+        return sdf_part, []
     nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
-    nearest_piece = torch.from_numpy(label[tuple(nearest)]).view(-1)
-    bridged, most, half_cell = sdf_part, 0.0, grid.spacing / 2
+    nearest_piece = label[tuple(nearest)]
+    bridged, half_cell = sdf_part, grid.spacing / 2
+    bridges: list[Bridge] = []
     # Outside the part its sdf is what the losses left there, often far below the true one: no swelling gets over it.
     true = torch.maximum(sdf_part, -distance_to(grid, sdf_part > 0))
     for piece in floating:
@@ -80,15 +104,13 @@ def bridge_gaps(
         seed = int(torch.where(core, sdf_part, -torch.inf).argmax())
         gap = float(-sdf_base[core].max())
         for step in range(1, int((BRIDGE_REACH - half_cell) / half_cell) + 1):
-            if not _reaches(
-                grid, inside_of(_swollen(sdf_part, true, sdf_base, own, gap, step * half_cell)), seed, sdf_base
-            ):
+            trial = Bridge(gap, step * half_cell, own)
+            if not _reaches(grid, inside_of(_swollen(sdf_part, true, sdf_base, trial)), seed, sdf_base):
                 continue
-            swelling = (step + 1) * half_cell
-            bridged = torch.maximum(bridged, _swollen(sdf_part, true, sdf_base, own, gap, swelling))
-            most = max(most, swelling)
+            bridges.append(Bridge(gap, (step + 1) * half_cell, own))
+            bridged = torch.maximum(bridged, _swollen(sdf_part, true, sdf_base, bridges[-1]))
             break
-    return bridged, most
+    return bridged, bridges
 
 
 def distance_to(grid: TetGrid, marked: Tensor) -> Tensor:
@@ -99,9 +121,9 @@ def distance_to(grid: TetGrid, marked: Tensor) -> Tensor:
     return torch.from_numpy(distance).view(-1).float()
 
 
-def _swollen(sdf_part: Tensor, true: Tensor, sdf_base: Tensor, where: Tensor, gap: float, swelling: float) -> Tensor:
-    weight = ((gap + 2 * swelling + sdf_base) / (2 * swelling)).clamp(0, 1) * where
-    return torch.where(weight > 0, torch.maximum(sdf_part, true + swelling * weight), sdf_part)
+def _swollen(sdf_part: Tensor, true: Tensor, sdf_base: Tensor, bridge: Bridge) -> Tensor:
+    weight = bridge_weight(sdf_base, bridge) * torch.from_numpy(bridge.own).view(-1)
+    return torch.where(weight > 0, torch.maximum(sdf_part, true + bridge.swelling * weight), sdf_part)
 
 
 def _reaches(grid: TetGrid, inside: Tensor, seed: int, sdf_base: Tensor) -> bool:
@@ -118,13 +140,17 @@ def _label(grid: TetGrid, marked: Tensor) -> tuple[np.ndarray, int]:
     return label_pieces(marked.view((grid.side,) * 3).numpy())
 
 
-def _part_shares(grid: TetGrid, label: np.ndarray, count: int, sdf_part: Tensor, owner: Tensor) -> np.ndarray:
+def _part_shares(label: np.ndarray, count: int, volume: np.ndarray, owner: np.ndarray) -> np.ndarray:
     """Which share of a named part's volume lies in a piece, (parts, 1 + count); the first column is not used."""
-    volume = (0.5 + sdf_part / grid.spacing).clamp(0, 1).numpy()
-    volume = np.where(sdf_part.numpy() > 0, volume, 0.0)
     shares = np.zeros((int(owner.max()) + 1, count + 1))
     for number, row in enumerate(shares):
-        row += np.bincount(label.reshape(-1), weights=volume * (owner.numpy() == number), minlength=count + 1)
+        row += np.bincount(label.reshape(-1), weights=(volume * (owner == number)).reshape(-1), minlength=count + 1)
         row[0] = 0.0
         row /= max(row.sum(), 1e-30)
     return shares
+
+
+def part_volume(grid: TetGrid, sdf_part: Tensor) -> np.ndarray:
+    """How much of a cell around each vertex (z, y, x) the part fills, at about."""
+    volume = (0.5 + sdf_part / grid.spacing).clamp(0, 1) * (sdf_part > 0)
+    return volume.view((grid.side,) * 3).numpy()

@@ -18,13 +18,15 @@ edge of its cut is left out: it ends on the base in a film that the grid makes r
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import reduce
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.solid.part_pieces import bridge_gaps, distance_to, fill_pockets, keep_large
+from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_gaps, distance_to, fill_pockets, keep_large, part_volume
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.extraction.marching_tets import crossing_faces, crossing_fraction, edge_ends
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
@@ -42,11 +44,45 @@ _FILLET_CELLS = 0.12
 lost in how far the extracted surface of a curved base is from the base itself, and end in a ragged rim."""
 
 
-def part_solid(stage: GeometryStage, name: str | None) -> Solid:
-    """The closed solid of one named part (None: of all together) in the canonical frame, without gradients.
+@dataclass(frozen=True)
+class LatticePart:
+    """What the training's grid knows of a part's solid: all of these are values per vertex of the grid.
 
-    It has no faces where the part is empty. Pieces too small to be meant are left out (see `keep_large`), closed
-    pockets filled, and gaps between part and base bridged where they are narrow (see `bridge_gaps`).
+    Attributes:
+        grid: the grid.
+        number: of the named part; None: all together.
+        positions: (count, 3) the vertices with their offsets.
+        fields: the solid is where all of them, (count,), are positive.
+        sdf_base: (count,) base sdf.
+        sdf_part: (count,) part sdf, bridges included.
+        owner: (count,) number of the named part that a vertex belongs to.
+        lead: (count,) half the lead of the part's regions over those of the others; None: nothing to cut off.
+        bridges: where the part swells to reach the base.
+        reach, sink: see `fillet_reach` and `SINK_CELLS`, canonical units.
+        cuts: whether the part is cut out of the base.
+    """
+
+    grid: TetGrid
+    number: int | None
+    positions: Tensor
+    fields: list[Tensor]
+    sdf_base: Tensor
+    sdf_part: Tensor
+    owner: Tensor
+    lead: Tensor | None
+    bridges: list[Bridge]
+    reach: float
+    sink: float
+    cuts: bool
+
+    @property
+    def bridged(self) -> float:
+        """How far the part had to swell to reach the base, canonical units; 0: it reached by itself."""
+        return max((bridge.swelling for bridge in self.bridges), default=0.0)
+
+
+def lattice_part(stage: GeometryStage, name: str | None) -> LatticePart:
+    """What the grid knows of one named part (None: of all together), without gradients.
 
     Raises:
         UserError: no part of that name.
@@ -73,19 +109,50 @@ def part_solid(stage: GeometryStage, name: str | None) -> Solid:
         return [torch.maximum(lowered, part) + fillet, sink - sdf_base]
 
     owner, leads = _ownership(stage)
-    bridged = 0.0
+    bridges: list[Bridge] = []
     if not cuts:  # a cavity in the base needs no way out
-        sdf_part, bridged = bridge_gaps(grid, sdf_base, sdf_part, owner, lambda part: _inside(limits(part)))
-    fields = limits(sdf_part)
-    inside, removed = keep_large(grid, _inside(fields), sdf_part, owner)
-    inside = fill_pockets(grid, inside, sdf_base < sink)
+        sdf_part, bridges = bridge_gaps(grid, sdf_base, sdf_part, owner, lambda part: _inside(limits(part)))
     number = None if name is None else list(stage.scene.parts).index(name)
-    if number is not None and len(stage.scene.parts) > 1:
-        fields.append(leads[number])
-        inside = inside & (leads[number] > 0)
-    vertices, faces = _surface(grid, positions, inside, fields)
-    islands = sum(removed) if number is None else removed[number]
-    return Solid(vertices.numpy(), faces.numpy(), islands, bridged)
+    lead = leads[number] if number is not None and len(stage.scene.parts) > 1 else None
+    return LatticePart(
+        grid, number, positions, limits(sdf_part), sdf_base, sdf_part, owner, lead, bridges, reach, sink, cuts
+    )
+
+
+def part_solid(stage: GeometryStage, name: str | None) -> Solid:
+    """The closed solid of one named part (None: of all together) in the canonical frame, as the training's grid has it.
+
+    It has no faces where the part is empty. Pieces too small to be meant are left out (see `keep_large`), closed
+    pockets filled, and gaps between part and base bridged where they are narrow (see `bridge_gaps`). No gradients.
+
+    Raises:
+        UserError: no part of that name.
+    """
+    part = lattice_part(stage, name)
+    inside, islands = _meant(part)
+    vertices, faces = _surface(part.grid, part.positions, inside, _with_lead(part))
+    return Solid(vertices.numpy(), faces.numpy(), islands, part.bridged)
+
+
+def part_surface(part: LatticePart) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of what `part_solid` makes of it."""
+    vertices, faces = _surface(part.grid, part.positions, _meant(part)[0], _with_lead(part))
+    return vertices.numpy(), faces.numpy()
+
+
+def _with_lead(part: LatticePart) -> list[Tensor]:
+    return part.fields if part.lead is None else [*part.fields, part.lead]
+
+
+def _meant(part: LatticePart) -> tuple[Tensor, int]:
+    """Where the solid is, (count,) bool, without stray islands and with its pockets filled; how many went."""
+    grid, shape = part.grid, (part.grid.side,) * 3
+    inside = _inside(part.fields).view(shape).numpy()
+    inside, removed = keep_large(inside, part_volume(grid, part.sdf_part), part.owner.view(shape).numpy())
+    filled = torch.from_numpy(fill_pockets(inside, (part.sdf_base < part.sink).view(shape).numpy())).view(-1)
+    if part.lead is not None:
+        filled = filled & (part.lead > 0)
+    return filled, sum(removed) if part.number is None else removed[part.number]
 
 
 def fillet_reach(k: float, spacing: float) -> float:

@@ -1,0 +1,187 @@
+"""The part's solid as it is handed over: from the functions themselves, finer than the training's grid, evenly meshed.
+
+The training marches a grid whose cells are as large as what a picture of 32 pixels can show. Its field is smooth
+beyond that; what looked torn was the marching. Here the same solid is
+
+1. sampled on a lattice three times finer, around its surface only, and marched (`fine_lattice`);
+2. remeshed into triangles of one size, every vertex on the function's zero set (`remesh`, `projection`);
+3. given that function's gradient for its normals.
+
+The offsets of the grid's vertices are left out: they are noise a tenth of a cell high, and make the dents.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from fd_mitsuba.export.bake.tangents import vertex_normals
+from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
+from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
+from fd_mitsuba.export.final_surface.projection import project
+from fd_mitsuba.export.final_surface.remesh import remesh
+from fd_mitsuba.export.solid.decimation import decimated
+from fd_mitsuba.export.solid.part_pieces import fill_pockets, keep_large
+from fd_mitsuba.export.solid.part_solid import LatticePart, lattice_part, part_solid, part_surface
+from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.training.geometry_stage import GeometryStage
+
+_FINER = (2, 4)
+"""How many times finer than the training's the lattice is: as its edges are to be, within these."""
+_SHORTEST_CELLS = 0.2
+"""Shorter edges than this, in cells of the training, show nothing more: the field's own cells are twice a cell."""
+_TRIES = 3
+"""Times that the edge is lengthened if there are still more faces than wanted."""
+_FILM_CELLS = 0.12
+"""Where the fillet is lower over the base, in cells of the training, the solid dives under the base."""
+_MESHED = 0.9
+"""Share of the budget that is aimed at: how many faces come out is known only afterwards."""
+
+
+@dataclass(frozen=True)
+class FinalPart:
+    """A part's final surface.
+
+    Attributes:
+        solid: canonical frame.
+        normals: (V, 3) float64 unit, of the function's gradient.
+        distance: (V,) how far the vertices are from the zero set, canonical units.
+    """
+
+    solid: Solid
+    normals: np.ndarray
+    distance: np.ndarray
+
+    def decimated(self, faces: int) -> FinalPart:
+        """The part with at most `faces` faces, or as few as stay a solid; its normals are those of the full surface."""
+        solid = decimated(self.solid, faces)
+        if solid is self.solid:
+            return self
+        full = MeshDistance(self.solid.vertices, self.solid.faces)
+        face, weights = full.nearest(solid.vertices)
+        normals = np.einsum("ij,ijk->ik", weights, self.normals[self.solid.faces[face]])
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return FinalPart(solid, normals / np.maximum(length, 1e-12), full.unsigned(solid.vertices))
+
+
+_NOTHING = FinalPart(Solid(np.zeros((0, 3)), np.zeros((0, 3))), np.zeros((0, 3)), np.zeros(0))
+
+
+def final_parts(
+    stage: GeometryStage, faces: int, say: Callable[[str], None] = lambda line: None
+) -> dict[str, FinalPart]:
+    """The final surface of every named part; see `final_part`."""
+    return {name: final_part(stage, name, faces, say) for name in stage.scene.parts}
+
+
+def final_part(
+    stage: GeometryStage, name: str | None, faces: int, say: Callable[[str], None] = lambda line: None
+) -> FinalPart:
+    """The final surface of one named part (None: of all together) with at most `faces` triangles, or few more.
+
+    Where no solid comes out of it, the training's own surface is taken, and a line says so.
+    """
+    coarse = lattice_part(stage, name)
+    spacing = coarse.grid.spacing
+    edge = max(_edge_for(_area(*part_surface(coarse)), faces), _SHORTEST_CELLS * spacing)
+    factor = int(np.clip(round(spacing / edge), *_FINER))
+    function = part_function(stage, coarse, factor)
+    made = refined(coarse.grid, _lattice(coarse, _least(coarse)), function.values, factor)
+    if made is None:
+        return _NOTHING
+    inside, islands = _meant(coarse, made)
+    vertices, triangles = made.surface(inside)
+    if not len(triangles):
+        return _NOTHING
+
+    def onto(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return project(function.with_gradient, points, 0.5 * made.spacing, 1, 1e-3 * spacing)[:2]
+
+    edge = max(_edge_for(_area(vertices, triangles), faces), _SHORTEST_CELLS * spacing)
+    vertices, triangles = remesh(vertices, triangles, edge, onto)
+    for _ in range(_TRIES):
+        if len(triangles) <= faces:
+            break
+        edge *= 1.05 * math.sqrt(len(triangles) / faces)
+        vertices, triangles = remesh(vertices, triangles, edge, onto, 3)
+    vertices, normals, distance = project(function.with_gradient, vertices, 0.5 * made.spacing, 12, 1e-4 * spacing)
+    solid = Solid(vertices, triangles, islands, coarse.bridged)
+    if not solid.manifold:
+        say(f"part {name or 'part'}: its fine surface is no solid; the training's own is written instead")
+        plain = part_solid(stage, name)
+        return FinalPart(plain, vertex_normals(plain.vertices, plain.faces), np.zeros(len(plain.vertices)))
+    return FinalPart(solid, normals, distance)
+
+
+def part_function(stage: GeometryStage, coarse: LatticePart, factor: int) -> PartFunction:
+    """The function of space whose zero set is the part's solid, bridges included.
+
+    Args:
+        factor: how many times finer than the training's a lattice for the part's own surface shall be.
+    """
+    scene, geometry, grid = stage.scene, stage.config.geometry, coarse.grid
+    base = None if coarse.cuts else MeshDistance(scene.base_canonical.vertices, scene.base_canonical.faces)
+
+    width = fillet_width(geometry.union_k)
+
+    def sdf_part(points: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+        return stage.field.evaluate(points, region).sdf
+
+    function = PartFunction(
+        sdf_part, list(scene.parts.values()), coarse.number, grid, base, width, geometry.union_only_outside,
+        fillet_reach(width, _FILM_CELLS * grid.spacing), coarse.sink,
+        _lattice(coarse, coarse.sdf_base), coarse.bridges,
+    )  # fmt: skip
+    if base is None:
+        return function
+    start, _ = stage.extractor.lattice_values(stage.field)
+    before = _surface_of(coarse, factor, start, lambda points: function.part_values(points, False))
+    if not coarse.bridges:
+        return replace(function, surface=(before, before))
+    function = replace(function, surface=(before, None))
+    after = _surface_of(coarse, factor, coarse.sdf_part, lambda points: function.part_values(points, True))
+    return replace(function, surface=(before, after))
+
+
+def _surface_of(
+    coarse: LatticePart, factor: int, values: torch.Tensor, function: Callable[[np.ndarray], np.ndarray]
+) -> MeshDistance | None:
+    made = refined(coarse.grid, _lattice(coarse, values), function, factor)
+    if made is None:
+        return None
+    vertices, faces = made.surface(made.values > 0)
+    return MeshDistance(vertices, faces) if len(faces) else None
+
+
+def _meant(coarse: LatticePart, made: FineLattice) -> tuple[np.ndarray, int]:
+    """Where the solid is on the fine lattice, without stray islands and with its pockets filled; how many went."""
+    part, base = (made.between(_lattice(coarse, x)) for x in (coarse.sdf_part, coarse.sdf_base))
+    owner = made.nearest(_lattice(coarse, coarse.owner))
+    inside = made.values > 0
+    mine = coarse.number if coarse.lead is not None else None
+    inside, removed = keep_large(inside, (part > 0) * (1.0 if mine is None else owner == mine), owner)
+    return fill_pockets(inside, base < coarse.sink), sum(removed) if mine is None else removed[mine]
+
+
+def _least(coarse: LatticePart) -> torch.Tensor:
+    fields = coarse.fields if coarse.lead is None else [*coarse.fields, coarse.lead]
+    return torch.stack(fields).amin(dim=0)
+
+
+def _lattice(coarse: LatticePart, values: torch.Tensor) -> np.ndarray:
+    return values.view((coarse.grid.side,) * 3).numpy()
+
+
+def _area(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+
+def _edge_for(area: float, faces: int) -> float:
+    """The edge of equal triangles that cover an area with the share of `faces` that is aimed at."""
+    return math.sqrt(4 * area / (math.sqrt(3) * _MESHED * faces))

@@ -1,0 +1,206 @@
+"""A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
+
+    part   = min(sdf_part, region + margin, room)      where the part may be at all
+    joined = max(sdf_base - max(away - reach, 0), part) + fillet
+    value  = min(joined, sink - sdf_base, lead)        positive inside the solid
+
+`sdf_base` and the distance to the part's own surface are exact distances to triangles, `sdf_part` is the network. See
+`part_solid` for `joined`, `sink` and `lead`. `away` here is the true distance to the part's surface, or `-part` where
+the field falls faster: the curve along which the solid dives under the base is as smooth as these are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
+from fd_mitsuba.extraction.active_vertices import DEFAULT_MARGIN
+from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+
+SdfPart = Callable[[Tensor, Tensor], Tensor]
+"""Points (N, 3) and the signed distance (N,) to the focal regions there -> `sdf_part` (N,), differentiable."""
+
+_STEP = 1e-3
+"""Of the differences that a region's gradient is made of, canonical units."""
+_AT_ONCE = 1 << 16
+
+
+def fillet_width(union_k: float) -> float:
+    """The width of a fillet without a crease that is as high where base and part meet as `soft_union`'s of `union_k`.
+
+    A fillet h^2 / (4 width), h = max(width - |sdf_base - sdf_part|, 0), is tangent to both surfaces. That of
+    `soft_union` is wider and flatter, and keeps 62 of the 90 degrees between a wall and the floor that it stands on.
+    """
+    return 0.4 * union_k
+
+
+def fillet_reach(width: float, film: float) -> float:
+    """How far from the part the fillet of `width` is higher than `film` over a flat base, canonical units."""
+    return max(width - math.sqrt(4 * width * film), 0.0)
+
+
+@dataclass(frozen=True)
+class PartFunction:
+    """What a part's solid is made of.
+
+    Attributes:
+        sdf_part: the part's field.
+        parts: the regions of all named parts.
+        number: the part that is meant; None: all together.
+        grid: the lattice of the training; the part keeps away from its border.
+        base: the base's surface; None where the part is cut out: then the solid is the part alone.
+        width: of the fillet, canonical units; see `fillet_width`.
+        union_only_outside: see `soft_union`.
+        reach: how far from the part the fillet is shown, canonical units.
+        sink: see `part_solid`.
+        base_lattice: (z, y, x) base sdf at the grid's vertices, to tell where the base is far away.
+        bridges: where the part swells to reach the base.
+        surface: the part's own surface before it swells, then after that; None: not known yet.
+    """
+
+    sdf_part: SdfPart
+    parts: Sequence[Sequence[FocalRegion]]
+    number: int | None
+    grid: TetGrid
+    base: MeshDistance | None
+    width: float
+    union_only_outside: bool
+    reach: float
+    sink: float
+    base_lattice: np.ndarray
+    bridges: Sequence[Bridge] = ()
+    surface: tuple[MeshDistance | None, MeshDistance | None] = (None, None)
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """The value (N,) float64 at points (N, 3), canonical."""
+        with torch.no_grad():
+            return self._in_pieces(points, lambda x: self._compose(x)[:, None])[:, 0]
+
+    def part_values(self, points: np.ndarray, swollen: bool) -> np.ndarray:
+        """`part` (N,) alone, before or after it swells towards the base."""
+        with torch.no_grad():
+            return self._in_pieces(points, lambda x: self._part(x, swollen)[:, None])[:, 0]
+
+    def with_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The value (N,) and its gradient (N, 3), float64; in a crease that of either side."""
+
+        def both(x: Tensor) -> Tensor:
+            x = x.requires_grad_()
+            value = self._compose(x)
+            (gradient,) = torch.autograd.grad(value.sum(), x)
+            return torch.cat([value.detach()[:, None], gradient], dim=1)
+
+        rows = self._in_pieces(points, both)
+        return rows[:, 0], rows[:, 1:]
+
+    def base_values(self, points: np.ndarray) -> np.ndarray:
+        """`sdf_base` (N,) at points (N, 3); far outside where there is no base."""
+        return np.full(len(points), -np.inf) if self.base is None else self.base.signed(points)
+
+    def _in_pieces(self, points: np.ndarray, function: Callable[[Tensor], Tensor]) -> np.ndarray:
+        points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+        rows = [function(torch.from_numpy(points[i : i + _AT_ONCE])) for i in range(0, len(points), _AT_ONCE)]
+        return torch.cat(rows).double().numpy() if rows else np.zeros((0, 4))
+
+    def _compose(self, x: Tensor) -> Tensor:
+        value = part = self._part(x, True)
+        near = torch.from_numpy(np.flatnonzero(self._near_base(x)))
+        if len(near):
+            chosen = x[near]
+            value = part.index_copy(0, near, self._beside_base(chosen, part[near], self._base_at(chosen)))
+        if self.number is None or len(self.parts) == 1:
+            return value
+        depths = [self._region(regions, x) for regions in self.parts]
+        others = torch.stack(depths[: self.number] + depths[self.number + 1 :]).amax(dim=0)
+        return torch.minimum(value, (depths[self.number] - others) / 2)
+
+    def _near_base(self, x: Tensor) -> np.ndarray:
+        """Whether (N,) the base may have a say: elsewhere it is too far below the part for a fillet or a rim."""
+        if self.base is None:
+            return np.zeros(len(x), dtype=bool)
+        swelling = max((bridge.gap + 2 * bridge.swelling for bridge in self.bridges), default=0.0)
+        return self._nearest(self.base_lattice, x) > -(max(self.width, swelling) + 2 * self.grid.spacing)
+
+    def _beside_base(self, x: Tensor, part: Tensor, base: Tensor) -> Tensor:
+        away = torch.where(part > 0, 0.0, torch.maximum(-part, self._distance_to(self.surface[1], x)))
+        lowered = base - (away - self.reach).clamp(min=0)
+        joined = torch.maximum(lowered, part) + self._fillet(base, part)
+        return torch.minimum(joined, self.sink - base)
+
+    def _fillet(self, base: Tensor, part: Tensor) -> Tensor:
+        if self.width == 0:
+            return torch.zeros_like(part)
+        overlap = (self.width - (base - part).abs()).clamp(min=0)
+        if self.union_only_outside:
+            overlap = torch.where(torch.maximum(base, part) < 0, overlap, 0.0)
+        return overlap * overlap / (4 * self.width)
+
+    def _part(self, x: Tensor, swollen: bool) -> Tensor:
+        region = self._region([region for regions in self.parts for region in regions], x)
+        room = self.grid.half_extent - 0.5 * self.grid.spacing - x.abs().amax(dim=1)
+        part = torch.minimum(torch.minimum(self.sdf_part(x, region), region + DEFAULT_MARGIN), room)
+        near = torch.from_numpy(np.flatnonzero(self._near_base(x)))
+        if not swollen or not self.bridges or not len(near):
+            return part
+        chosen, own = x[near], part[near]
+        base, true = self._base_at(chosen), torch.maximum(own, -self._distance_to(self.surface[0], chosen))
+        for bridge in self.bridges:
+            weight = bridge_weight(base, bridge) * torch.from_numpy(self._nearest(bridge.own, chosen))
+            own = torch.where(weight > 0, torch.maximum(own, true + bridge.swelling * weight), own)
+        return part.index_copy(0, near, own)
+
+    def _nearest(self, lattice: np.ndarray, x: Tensor) -> np.ndarray:
+        """The value of `lattice` (z, y, x) at the vertex next to each point."""
+        grid = self.grid
+        index = ((x.detach().numpy() + grid.half_extent) / grid.spacing).round().astype(int).clip(0, grid.resolution)
+        return lattice[index[:, 2], index[:, 1], index[:, 0]].astype(np.float32)
+
+    def _base_at(self, x: Tensor) -> Tensor:
+        assert self.base is not None
+        points = x.detach().double().numpy()
+        distance, away = self._from(self.base, points)
+        sign = np.sign(self._nearest(self.base_lattice, x)).astype(np.float64)
+        near = np.flatnonzero(distance < self.grid.spacing)  # elsewhere the vertex next to it is on the same side
+        sign[near] = np.where(self.base.inside(points[near]), 1.0, -1.0)
+        return _attached(x, sign * distance, sign[:, None] * away)
+
+    def _distance_to(self, surface: MeshDistance | None, x: Tensor) -> Tensor:
+        """The distance (N,) to a surface; 0 everywhere while it is not known."""
+        if surface is None:
+            return torch.zeros(len(x))
+        return _attached(x, *self._from(surface, x.detach().double().numpy()))
+
+    @staticmethod
+    def _from(mesh: MeshDistance, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The distance (N,) to a mesh's triangles and its gradient (N, 3)."""
+        offset = points - mesh.feet(points)
+        distance = np.linalg.norm(offset, axis=1)
+        return distance, offset / np.maximum(distance, 1e-12)[:, None]
+
+    def _region(self, regions: Sequence[FocalRegion], x: Tensor) -> Tensor:
+        points = x.detach().double().numpy()
+        value = union_sdf(list(regions), points)
+        if not x.requires_grad:
+            return torch.from_numpy(value)
+        gradient = np.empty_like(points)
+        for axis, step in enumerate(np.eye(3) * _STEP):
+            ahead, behind = union_sdf(list(regions), points + step), union_sdf(list(regions), points - step)
+            gradient[:, axis] = (ahead.astype(np.float64) - behind) / (2 * _STEP)
+        return _attached(x, value, gradient)
+
+
+def _attached(x: Tensor, value: np.ndarray, gradient: np.ndarray) -> Tensor:
+    """Values (N,) of a function of `x` (N, 3) that torch takes for one with the given gradient (N, 3)."""
+    constant = torch.from_numpy(np.asarray(value, dtype=np.float32))
+    if not x.requires_grad:
+        return constant
+    slope = torch.from_numpy(gradient.astype(np.float32))
+    return constant + (slope * (x - x.detach())).sum(dim=1)

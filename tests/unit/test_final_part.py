@@ -1,0 +1,236 @@
+"""The final surface of a part against closed forms: balls on a ball, whose every function is known."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import manifold3d
+import numpy as np
+import pytest
+import torch
+from test_part_solid import BASE_RADIUS, ball_volume, check, lens, stage_of
+from test_surface_quality import BOX
+
+from fd_mitsuba.evaluation.joint import measure_joint
+from fd_mitsuba.evaluation.surface_quality import smallest_angles
+from fd_mitsuba.export.final_surface import final_part as module
+from fd_mitsuba.export.final_surface.final_part import FinalPart, final_part, final_parts
+from fd_mitsuba.export.solid.part_solid import SINK_CELLS, part_solid
+from fd_mitsuba.extraction.subtraction import SubtractionExtractor
+from fd_mitsuba.fields.part_sdf import PartField, PartValues
+from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+
+FACES = 4000
+CENTRE, RADIUS = np.array([0.0, 0.62, 0.0]), 0.25
+
+
+def stage_with_base(*arguments: object, **options: object) -> SimpleNamespace:
+    """`stage_of`, and the base's surface, which the final one is measured against."""
+    stage = stage_of(*arguments, **options)  # type: ignore[arg-type]
+    vertices, faces = unit_sphere(5)
+    stage.scene.base_canonical = TriangleMesh("base", vertices * BASE_RADIUS, faces)
+    return stage
+
+
+def one_ball(k: float = 0.15) -> SimpleNamespace:
+    return stage_with_base({"part": [(tuple(CENTRE), RADIUS)]}, k=k)
+
+
+def outside(part: FinalPart) -> np.ndarray:
+    return np.linalg.norm(part.solid.vertices, axis=1) > BASE_RADIUS
+
+
+def test_without_fillet_it_is_the_ball_outside_of_the_base_and_sunk_inside() -> None:
+    stage = one_ball(k=0.0)
+    part = final_part(stage, None, FACES)
+    check(part.solid)
+    spacing, vertices = stage.grid.spacing, part.solid.vertices
+    from_ball = np.linalg.norm(vertices - CENTRE, axis=1) - RADIUS
+    assert np.abs(from_ball[outside(part)]).max() < 0.002 * spacing
+    assert part.distance.max() < 0.002 * spacing
+    deepest = BASE_RADIUS - SINK_CELLS * spacing
+    assert np.linalg.norm(vertices, axis=1).min() == pytest.approx(deepest, abs=0.03 * spacing)
+    base = manifold3d.Manifold.sphere(BASE_RADIUS, 512)
+    shown = (part.solid.to_manifold() - base).volume()
+    assert shown == pytest.approx(ball_volume(RADIUS) - lens(RADIUS, BASE_RADIUS, CENTRE[1]), rel=0.005)
+
+
+def test_triangles_are_even_and_as_many_as_wanted() -> None:
+    for faces in (2000, 6000):
+        solid = final_part(one_ball(), None, faces).solid
+        assert 0.75 * faces < len(solid.faces) <= faces
+        angles = smallest_angles(solid.vertices, solid.faces)
+        assert np.percentile(angles, 5) > 35 and angles.min() > 5
+
+
+def test_a_small_part_gets_no_more_faces_than_show_something() -> None:
+    solid = final_part(one_ball(), None, 500_000).solid
+    assert len(solid.faces) < 100_000
+    sides = solid.vertices[solid.faces]
+    lengths = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    assert lengths.mean() == pytest.approx(0.2 * 2.1 / 40, rel=0.1)
+
+
+def test_normals_are_the_functions() -> None:
+    part = final_part(one_ball(k=0.0), None, FACES)
+    offset = part.solid.vertices - CENTRE
+    on_ball = np.linalg.norm(part.solid.vertices, axis=1) > BASE_RADIUS + 0.02
+    cosine = np.einsum("ij,ij->i", part.normals, offset / np.linalg.norm(offset, axis=1, keepdims=True))
+    assert on_ball.sum() > 1000 and cosine[on_ball].min() > np.cos(np.radians(0.5))
+    assert np.abs(np.linalg.norm(part.normals, axis=1) - 1).max() < 1e-9
+
+
+def test_the_fillet_is_as_high_as_the_unions_and_has_no_crease() -> None:
+    stage = one_ball()
+    part = final_part(stage, None, 30_000)
+    check(part.solid)
+    from_base = np.linalg.norm(part.solid.vertices, axis=1) - BASE_RADIUS
+    from_ball = np.linalg.norm(part.solid.vertices - CENTRE, axis=1) - RADIUS
+    between = (np.abs(from_base - from_ball) < 0.1 * stage.grid.spacing) & (from_base > 0)
+    # soft_union is 0 where max + 0.1 k = 0.
+    assert between.sum() > 20 and from_base[between] == pytest.approx(0.1 * 0.15, abs=0.05 * stage.grid.spacing)
+    union = stage.extractor(stage.field)
+    to_solid = MeshDistance(part.solid.vertices, part.solid.faces).unsigned(union.vertices.detach().numpy())
+    assert to_solid[union.part_weight.detach().numpy() > 0.99].max() < 0.25 * stage.grid.spacing
+    # Where the part rises from the base, the angle between faces side by side stays small.
+    corners = part.solid.vertices[part.solid.faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    keys = np.sort(np.stack([part.solid.faces, np.roll(part.solid.faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
+    order = np.lexsort(keys.T)
+    pairs = order.reshape(-1, 2) // 3
+    above = (from_base[part.solid.faces[pairs]] > 0.3 * stage.grid.spacing).all(axis=(1, 2))
+    cosine = np.einsum("ij,ij->i", normal[pairs[above, 0]], normal[pairs[above, 1]])
+    assert above.sum() > 1000 and np.degrees(np.arccos(cosine.min())) < 30
+
+
+def test_the_joint_is_one_smooth_circle() -> None:
+    stage = one_ball()
+    base = MeshDistance(stage.scene.base_canonical.vertices, stage.scene.base_canonical.faces)
+    spacing = stage.grid.spacing
+    joint = measure_joint(*(lambda s: (s.vertices, s.faces))(final_part(stage, None, FACES).solid), base, spacing)
+    before = measure_joint(*(lambda s: (s.vertices, s.faces))(part_solid(stage, None)), base, spacing)
+    assert joint.curves == 1 and joint.notches.max() < 0.1
+    radius = joint.length / (2 * np.pi)
+    assert np.percentile(joint.turning_deg, 95) < 1.5 * np.degrees(1 / radius) < np.percentile(before.turning_deg, 95)
+
+
+def test_a_gap_is_bridged_as_the_grid_has_decided() -> None:
+    stage = stage_with_base({"part": [((0.0, BASE_RADIUS + 0.08 + 0.2, 0.0), 0.2)]})
+    part = final_part(stage, None, FACES)
+    check(part.solid)
+    assert part.solid.bridged == part_solid(stage, None).bridged > 0
+    assert part.solid.gap(stage.scene.base_canonical) == 0.0 and part.solid.pieces().max() == 0
+    far = part.solid.vertices[:, 1] > BASE_RADIUS + 0.08 + 2 * part.solid.bridged + stage.grid.spacing
+    away = np.linalg.norm(part.solid.vertices[far] - [0, BASE_RADIUS + 0.28, 0], axis=1) - 0.2
+    assert far.sum() > 50 and np.abs(away).max() < 1e-3
+
+
+def test_islands_go_and_what_floats_stays() -> None:
+    balls = [((0.0, 0.62, 0.0), 0.25), ((0.8, 0.6, 0.0), 0.04), ((-0.8, 0.6, 0.0), 0.04)]
+    solid = final_part(stage_with_base({"part": balls}), None, FACES).solid
+    check(solid)
+    assert solid.islands_removed == 2 and np.abs(solid.vertices[:, 0]).max() < 0.5
+    floating = final_part(stage_with_base({"part": [((0.0, 0.85, 0.0), 0.15)]}), None, FACES).solid
+    assert floating.volume == pytest.approx(ball_volume(0.15), rel=0.005)
+
+
+class Hollow(PartField):
+    """A ball with a ball-shaped void."""
+
+    def evaluate(self, points: torch.Tensor, initial_sdf: torch.Tensor) -> PartValues:
+        void = (points - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1) - 0.1
+        return PartValues(torch.minimum(initial_sdf, void), torch.zeros_like(points))
+
+
+def test_pockets_are_filled() -> None:
+    stage = stage_with_base({"part": [((0.0, 0.75, 0.0), 0.25)]})
+    full = final_part(stage, None, FACES).solid
+    values, positions = stage.extractor.lattice_values(stage.field)
+    hollow = torch.minimum(values, (positions - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1) - 0.1)
+    stage.extractor.lattice_values = lambda field: (hollow, positions)
+    stage.field = Hollow()
+    solid = final_part(stage, None, FACES).solid
+    check(solid)
+    assert solid.volume == pytest.approx(full.volume, rel=1e-3)
+
+
+def test_named_parts_are_solids_of_their_own_and_fill_the_whole() -> None:
+    balls = {"left": [((-0.15, 0.6, 0.0), 0.22)], "right": [((0.15, 0.6, 0.03), 0.22)]}
+    stage = stage_with_base(balls)
+    parts, whole = final_parts(stage, FACES), final_part(stage, None, FACES).solid
+    left, right = parts["left"].solid, parts["right"].solid
+    for solid in (left, right, whole):
+        check(solid)
+    assert left.volume + right.volume == pytest.approx(whole.volume, rel=0.005)
+    assert (left.to_manifold() ^ right.to_manifold()).volume() < 1e-3 * whole.volume
+
+
+def test_a_part_that_is_cut_out_is_the_ball_itself() -> None:
+    stage = one_ball()
+    stage.extractor = SubtractionExtractor(
+        stage.grid, stage.sdf_base, stage.region_sdf, stage.extractor.active_index, 0.15
+    )
+    part = final_part(stage, None, FACES)
+    check(part.solid)
+    assert part.solid.volume == pytest.approx(ball_volume(RADIUS), rel=0.005)
+    assert np.abs(np.linalg.norm(part.solid.vertices - CENTRE, axis=1) - RADIUS).max() < 1e-4
+
+
+def test_edges_of_a_box_stay() -> None:
+    """Its edge is rounded by less than a cell of the training: far from the base, the field is the box itself."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.2 + [0, 0.8, 0]
+    stage = one_ball(k=0.0)
+    box = FocalRegion("part", np.eye(4), "part", TriangleMesh("box", corners, np.array(BOX)))
+    stage.scene.parts = {"part": (box,)}
+    stage.region_sdf = torch.from_numpy(union_sdf([box], stage.grid.vertices.numpy()))
+    active = (stage.region_sdf > -0.15).nonzero()[:, 0]
+    stage.extractor = type(stage.extractor)(stage.grid, stage.sdf_base, stage.region_sdf, active, 0.0)
+    solid = final_part(stage, None, 20_000).solid
+    check(solid)
+    along = np.linspace(0.62, 0.98, 200)
+    edge = np.stack([np.full(200, 0.2), along, np.full(200, 0.2)], axis=1)
+    # A quarter circle of radius r leaves r (sqrt(2) - 1) to the edge.
+    gone = MeshDistance(solid.vertices, solid.faces).unsigned(edge).max()
+    assert gone / (math.sqrt(2) - 1) < stage.grid.spacing
+
+
+def test_nothing_gives_no_faces() -> None:
+    stage = one_ball()
+    positions = stage.grid.vertices
+    stage.extractor.lattice_values = lambda field: (torch.full((len(positions),), -10.0), positions)
+    assert len(final_part(stage, None, FACES).solid.faces) == 0
+
+
+def test_what_comes_out_no_solid_is_replaced_by_the_trainings_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, lines = one_ball(), []
+
+    def torn(vertices: np.ndarray, faces: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+        return vertices, faces[50:]
+
+    monkeypatch.setattr(module, "remesh", torn)
+    part = final_part(stage, "part", FACES, lines.append)
+    assert np.array_equal(part.solid.faces, part_solid(stage, "part").faces) and len(part.normals) == len(
+        part.solid.vertices
+    )
+    assert len(lines) == 1 and "part part" in lines[0] and "training" in lines[0]
+
+
+def test_fewer_faces_keep_the_shape_and_the_normals() -> None:
+    full = final_part(one_ball(k=0.0), None, 20_000)
+    small = full.decimated(1000)
+    check(small.solid)
+    assert len(small.solid.faces) <= 1000 and full.decimated(10**6) is full
+    offset = small.solid.vertices - CENTRE
+    on_ball = np.linalg.norm(small.solid.vertices, axis=1) > BASE_RADIUS + 0.03
+    cosine = np.einsum("ij,ij->i", small.normals, offset / np.linalg.norm(offset, axis=1, keepdims=True))
+    assert on_ball.sum() > 100 and cosine[on_ball].min() > np.cos(np.radians(3))
+
+
+def test_the_same_twice() -> None:
+    one, other = (final_part(one_ball(), None, FACES) for _ in range(2))
+    assert np.array_equal(one.solid.vertices, other.solid.vertices) and np.array_equal(one.normals, other.normals)
