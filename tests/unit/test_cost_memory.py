@@ -29,6 +29,7 @@ BOTH = ("geometry", "appearance")
 # on 2 cores with `VmHWM`; None where it was not measured.
 PEAKS = {
     "as shipped": (CAT, [], 1633, 1155),
+    "all its steps": (CAT, ["geometry.steps=400"], 1626, 1163),
     "one thread": (CAT, [], 1645, 1167),
     "1.09 million faces": (SceneSize(1_088_768, 131_072, 1_916_928), [], 2524, 1958),
     "2.0 million faces": (SceneSize(1_999_872, 131_072, 1_916_928), [], 3538, 2850),
@@ -48,6 +49,12 @@ def test_peaks_that_were_measured(name: str) -> None:
     assert sum(run_memory(size, config, BOTH, 7e6).values()) == pytest.approx(whole, rel=0.15)
     if geometry is not None:
         assert sum(run_memory(size, config, ("geometry",), 7e6).values()) == pytest.approx(geometry, rel=0.15)
+
+
+def test_peaks_of_a_smoke_run() -> None:
+    config = RunConfig.load(ROOT / "configs" / "smoke.toml", ["output.turntable_frames=2"])
+    assert sum(run_memory(CAT, config, BOTH, 7e6).values()) == pytest.approx(1155, rel=0.15)
+    assert sum(run_memory(CAT, config, ("geometry",), 7e6).values()) == pytest.approx(821, rel=0.15)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from fd_mitsuba.render.vertex_normals import area_sums, vertex_normals
 from fd_mitsuba.scene.views import CameraBatch
 
 _CHANNELS = len(GEOMETRY_CHANNELS)
-_RAYS_AT_ONCE = 1 << 22
+RAYS_AT_ONCE = 1 << 22
 
 
 class GeometryPass:
@@ -141,9 +141,9 @@ class GeometryPass:
         if not len(mesh.faces):
             return pictures
         spp = self.spp if spp is None else spp
-        rounds = -(-spp * self.size**2 // _RAYS_AT_ONCE)
+        rounds = -(-spp * self.size**2 // RAYS_AT_ONCE)
         samples = -(-spp // rounds)
-        together = max(1, _RAYS_AT_ONCE // (samples * self.size**2))
+        together = max(1, RAYS_AT_ONCE // (samples * self.size**2))
         self._tracer.set_mesh(mesh.vertices, mesh.faces, mesh.static_faces)
         with torch.no_grad():
             normals = self._normals(vertices, faces, mesh, mesh.static_vertices)

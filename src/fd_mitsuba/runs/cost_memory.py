@@ -13,17 +13,18 @@ from pathlib import Path
 from PIL import Image
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.config.sections import MOST_SAMPLES, FieldConfig, TextureConfig
+from fd_mitsuba.config.sections import MOST_SAMPLES, FieldConfig, OutputConfig, TextureConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import available_bytes, held_bytes
 from fd_mitsuba.io.picture_size import picture_size
+from fd_mitsuba.render.geometry_pass import RAYS_AT_ONCE
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.viewing.lit_views import VIEWS_AT_ONCE
 
 _MIB = 2.0**20
 _IMPORTS, _BUILTIN = 390.0, 200.0
-_SHAPE, _MATERIAL = 550.0, 490.0
+_SHAPE, _MATERIAL = 210.0, 490.0
 """What the geometry stage with its exports, and then the appearance stage with its own, add in any case."""
 _PER_FACE = {"check": 830.0, "run": 990.0}
 _PER_LIGHT_PIXEL = {"check": 70.0, "run": 112.0}
@@ -33,7 +34,8 @@ _PER_GRID_VERTEX = 140.0
 _PER_TEXEL = 178.0
 _PER_TABLE_BYTE = 10.0
 """A field's parameters, their gradients and moments, and the copies of a checkpoint."""
-_PER_SAMPLE = 59.0
+_PER_SAMPLE, _PER_RAY, _PER_FRAME_PIXEL = 59.0, 85.0, 30.0
+_USUAL_FRAME_PIXELS = 48 * 256**2
 _USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, VIEWS_AT_ONCE * 256**2 * 12, 1024**2
 _TIGHT, _TOO_MUCH = 0.9, 1.25
 """Shares of what is left from which a run is warned of, and refused: the forecast is right to about 15 %."""
@@ -91,18 +93,19 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet
     terms |= _scene_terms(size, "run" if lit else "check")
     if not lit:  # a large light takes most while it is read, when the rest of the run is not there yet
         light = size.light_pixels / _MIB
-        terms["light"] = max(_PER_HELD_LIGHT_PIXEL * light, terms["light"] - _SHAPE)
+        terms["light"] = max(_PER_HELD_LIGHT_PIXEL * light, terms["light"] - _SHAPE - _ring(config.output))
     grid = (config.geometry.grid_resolution + 1) ** 3
     terms["geometry.grid_resolution"] = _PER_GRID_VERTEX * (grid - _USUAL_GRID) / _MIB
     terms["field.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.field) / _MIB
     terms["guidance.model"] = _guidance(config, stages, unet_weights)
+    terms["output.turntable_size"] = _ring(config.output)
     if lit:
         settings, output = config.appearance, config.output
         side = settings.picture_size or (32 if config.guidance.model == "builtin" else 512)
         step = settings.views * side**2 * settings.spp
         turn = VIEWS_AT_ONCE * output.turntable_size**2 * _VIDEO_SPP
         name = "output.turntable_size" if turn >= step else "appearance.spp"
-        terms[name] = _PER_SAMPLE * (max(turn, step) - _USUAL_SAMPLES) / _MIB
+        terms[name] = terms.get(name, 0.0) + _PER_SAMPLE * (max(turn, step) - _USUAL_SAMPLES) / _MIB
         terms["output.texture_size"] = _PER_TEXEL * (output.texture_size**2 - _USUAL_TEXELS) / _MIB
         terms["texture.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.texture) / _MIB
     return terms
@@ -159,6 +162,14 @@ def _scene_terms(size: SceneSize, command: str) -> dict[str, float]:
         "light": _PER_LIGHT_PIXEL[command] * size.light_pixels / _MIB,
         "textures": _PER_TEXTURE_VALUE[command] * size.texture_values / _MIB,
     }
+
+
+def _ring(output: OutputConfig) -> float:
+    """The turntable of the shape: a portion of its rays, and all of its frames."""
+    pixels = output.turntable_frames * output.turntable_size**2
+    sheet = 8 * min(output.turntable_size, 192) ** 2
+    portion = min(RAYS_AT_ONCE, 9 * max(pixels, sheet))
+    return (_PER_RAY * portion + _PER_FRAME_PIXEL * (pixels - _USUAL_FRAME_PIXELS)) / _MIB
 
 
 def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float) -> float:
