@@ -101,6 +101,25 @@ def test_a_finished_shape_takes_another_material(place: Path, finished: Path) ->
     assert stages == {"appearance"}
 
 
+def test_a_run_goes_on_where_its_scene_is_gone(place: Path, finished: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """By the same rule as other commands: the copy is read, and that is said. Another path is no excuse."""
+    copy = shutil.copytree(finished, place / "without_scene")
+    hidden = place / "hidden.xml"
+    (place / "scene.xml").rename(hidden)
+    capfd.readouterr()
+    try:
+        assert run(place, "without_scene", "--resume") == 0
+        assert f"gone; taking the copy of it in {copy / 'scene'}" in capfd.readouterr().err
+        assert main(["run", str(place / "typo.xml"), "-o", str(copy), "--resume"]) == 1
+        assert "typo.xml: no such scene file" in capfd.readouterr().err
+        assert run(place, "nothing_there", "--resume") == 1
+        assert "scene.xml: no such scene file" in capfd.readouterr().err
+    finally:
+        hidden.rename(place / "scene.xml")
+    same = "export/part_part.ply"
+    assert (copy / same).read_bytes() == (finished / same).read_bytes()
+
+
 def test_a_finished_shape_is_not_taken_for_other_regions(
     place: Path, finished: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,13 +38,18 @@ def run_options(parser: argparse.ArgumentParser, folder: str) -> None:
 def run_scene(options: argparse.Namespace) -> int:
     """Edit `options.scene`, print where the result is and how good it is."""
     settings = chosen_settings(options)
+    folder = Path(options.output) if options.output else Path("runs") / Path(options.scene).resolve().parent.name
+    if options.resume:
+        from fd_mitsuba.runs.resumed_scene import resumed_scene
+
+        options.scene, options.regions = resumed_scene(folder, options.scene, options.regions, remark)
     scene = load(options, config=settings.config)
     from fd_mitsuba.api import STAGES, edit
 
     run = edit(
         scene,
         settings,
-        output=options.output or Path("runs") / Path(options.scene).resolve().parent.name,
+        output=folder,
         resume=options.resume,
         quiet=options.quiet,
         stages=STAGES if options.stage == "all" else (options.stage,),

@@ -155,7 +155,10 @@ def _refuse_other_run(scene: EditScene, config: RunConfig, folder: Path) -> None
         if known.get(key) != now[key]:
             raise UserError(f"{folder}: holds a run with other {key} ({known.get(key)!r}, now {now[key]!r}); {remedy}")
     if known.get("scene_hash") != now["scene_hash"]:
-        raise UserError(f"{folder}: holds a run of another scene, or a file of the scene was changed since; {remedy}")
+        copy = f"; the scene as it was is in {folder / 'scene'}" if (folder / "scene").is_dir() else ""
+        raise UserError(
+            f"{folder}: holds a run of another scene, or a file of the scene was changed since; {remedy}{copy}"
+        )
     # Only the settings that a finished or begun stage has used count.
     stage = "appearance" if list_checkpoints(checkpoint_folder(folder, "appearance")) else "geometry"
     before = _settings(folder)
