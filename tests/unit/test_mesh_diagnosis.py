@@ -70,6 +70,14 @@ def test_concave_faces_of_an_obj(tmp_path: Path, mi: object) -> None:
         assert (obj_concave_face(path) is not None) == wrong, start
 
 
+def test_what_stands_beside_faces_is_no_matter(tmp_path: Path) -> None:
+    path = prism(tmp_path / "m.obj", 0)
+    path.write_text(path.read_text().replace("f 7 8", "f 7 8 # ", 1) + "f 1 2 3 4 seven\n# end\n")
+    assert obj_concave_face(path) is None
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1/ 2/ 3/ 4/ # a square\n")
+    assert obj_concave_face(path) is None
+
+
 def test_a_concave_base_is_refused(make_scene: Make, tmp_path: Path) -> None:
     path = make_scene(base='<shape type="obj" id="body"><string name="filename" value="m.obj"/></shape>')
     prism(tmp_path / "m.obj", 0)

@@ -63,7 +63,8 @@ def _of_ply(path: Path) -> np.ndarray | None:
         return np.array([[float(row[place]) for place in places] for row in rows])
     order = ">" if header.format.endswith("big_endian") else "<"
     table = np.frombuffer(data, [(item.name, order + _TYPES[item.type]) for item in properties], count)
-    return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # of damaged bytes, which are compared with what Mitsuba has read
+        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 def _of_obj(path: Path) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from fd_mitsuba.scene.ply_header import PlyHeader, read_ply_header
 
+_POLYGON = re.compile(rb"^f(?:[ \t]+[^\s]+){4}", re.MULTILINE)
 _TRIANGULATE = "triangulate the mesh as you export it"
 _INDICES = ("vertex_index", "vertex_indices")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
@@ -22,7 +24,7 @@ def mesh_fault(path: Path) -> str | None:
             return _ply_fault(path)
         if path.suffix.lower() == ".obj":
             return _obj_fault(path)
-    except (OSError, ValueError, IndexError, OverflowError):
+    except (OSError, ValueError, IndexError, KeyError, OverflowError):
         return None
     return None
 
@@ -39,6 +41,15 @@ def obj_concave_face(path: Path) -> int | None:
 
     Mitsuba cuts from the first corner, which is right for convex faces only. None where there is no such face.
     """
+    if not _POLYGON.search(path.read_bytes()):
+        return None  # in seconds less, for a mesh of millions of triangles
+    try:
+        return _concave_face(path)
+    except (ValueError, IndexError):
+        return None  # Mitsuba has read the file, and knows better what it says
+
+
+def _concave_face(path: Path) -> int | None:
     positions: list[list[float]] = []
     number = 0
     for word, words in _obj_lines(path):
@@ -66,7 +77,7 @@ def _obj_lines(path: Path) -> Iterator[tuple[bytes, list[bytes]]]:
     with open(path, "rb") as file:
         for line in file:
             if line.startswith((b"v", b"f")):
-                words = line.split()
+                words = line.partition(b"#")[0].split()
                 yield words[0], words
 
 
