@@ -43,6 +43,8 @@ def run(scene: object, output: Path, *more: object) -> list[object]:
     return [
         "run",
         scene,
+        "-c",
+        "quick",
         "-q",
         "--stage",
         "geometry",

@@ -138,6 +138,7 @@ def test_the_run_has_all_that_a_run_can_have(whole: tuple[dict[str, bytes], floa
     assert ".lock" not in names and not [name for name in names if name.endswith(".tmp")]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_killed_at_random_moments_of_both_stages(place: Path, whole: tuple[dict[str, bytes], float]) -> None:
     kill_until_done(place, whole, kills=2, seed=random.randrange(10**6))

@@ -67,6 +67,8 @@ def load(
     """
     parameters = definitions(options)
     quiet_libraries(options)
+    if options.prompt is not None and not options.prompt.strip():
+        raise UserError("--prompt: is blank; describe the edited object")
     from fd_mitsuba.api import load_scene
 
     return load_scene(
