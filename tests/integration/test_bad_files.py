@@ -205,7 +205,7 @@ def test_control_characters_in_a_prompt_do_not_reach_the_terminal(forked: Forked
     assert outcome.kind in (WORKS, REFUSED), outcome.errors
     shown = outcome.output + outcome.errors
     assert "wings" in shown and not {"\u009b", "\u202e"} & set(shown)
-    outcome = forked.run("check", make_scene(), "--prompt", "a \x1b]0;x\x07cat")
+    outcome = forked.run("check", make_scene(), "--prompt", "a \x1b]0;x\x07cat with wings")
     assert outcome.kind == WORKS and "x" in outcome.output and not {"\x1b", "\x07"} & set(outcome.output)
 
 

@@ -126,7 +126,7 @@ def test_the_base_keeps_the_digits_of_its_file(tmp_path: Path, kind: str) -> Non
 
 
 def test_check_names_the_step() -> None:
-    (warning,) = check_scene(load_edit_scene(FAR / "scene.xml"), RunConfig()).warnings
+    (warning,) = check_scene(load_edit_scene(FAR / "scene.xml"), RunConfig.load("quick")).warnings
     assert "reach 5.41e+04, where 32-bit floats are 0.0039 apart, 0.12% of its size" in warning
     assert "move everything to the origin" in warning
 

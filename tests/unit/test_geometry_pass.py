@@ -94,7 +94,7 @@ def test_portions_do_not_change_pictures(monkeypatch: pytest.MonkeyPatch) -> Non
     mesh, cameras, view = ball(3), views(0, 50, 120), GeometryPass(16)
     whole = view.render_primal(*mesh, cameras, 7)
     torch.testing.assert_close(whole, view.render(*mesh, cameras, 7), atol=1e-5, rtol=0)  # drawn, not traced
-    monkeypatch.setattr("fd_mitsuba.render.geometry_pass._RAYS_AT_ONCE", 2 * 4 * 16**2)
+    monkeypatch.setattr("fd_mitsuba.render.geometry_pass.RAYS_AT_ONCE", 2 * 4 * 16**2)
     assert torch.equal(whole, view.render_primal(*mesh, cameras, 7))
     many = view.render_primal(*mesh, cameras, 7, spp=64)
     assert (many - whole).abs().mean() < 0.02 and many.shape == (3, 5, 16, 16)

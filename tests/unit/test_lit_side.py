@@ -87,13 +87,13 @@ def rendered(path: Path, mi: Any) -> np.ndarray:
 def test_inward_faces_that_are_flipped_are_lit_rightly(mi: Any) -> None:
     path = INSIDE / "inv_flip" / "scene.xml"
     assert rendered(path, mi) == pytest.approx([0.65, 0.34, 0.24], abs=0.02)
-    assert check_scene(load_edit_scene(path), RunConfig()).warnings == ()
+    assert check_scene(load_edit_scene(path), RunConfig.load("quick")).warnings == ()
 
 
 def test_a_mirrored_mesh_is_told(mi: Any) -> None:
     path = INSIDE / "mir_nonormals" / "scene.xml"
     assert rendered(path, mi) == pytest.approx([0, 0, 0], abs=1e-6)
-    (warning,) = check_scene(load_edit_scene(path), RunConfig()).warnings
+    (warning,) = check_scene(load_edit_scene(path), RunConfig.load("quick")).warnings
     assert "base base: it is black from outside" in warning and "flip_normals" in warning
 
 
