@@ -1,6 +1,6 @@
 # fd_mitsuba on a CPU, for `docker run`. Not tested by this project's CI, which has no Docker.
 #   docker build -t fd_mitsuba .
-#   docker run --rm -v "$PWD/runs:/work/runs" fd_mitsuba demo
+#   docker run --rm -v "$PWD/runs:/data/runs" fd_mitsuba demo
 FROM python:3.12-slim-trixie
 
 RUN apt-get update \
@@ -13,6 +13,6 @@ RUN pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu 
 COPY . /src
 RUN pip install --no-cache-dir /src && rm -rf /src
 
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["fd_mitsuba"]
 CMD ["doctor"]

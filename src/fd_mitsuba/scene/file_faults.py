@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fd_mitsuba.backend.file_threads import file_threads
-from fd_mitsuba.backend.parser_message import remedy_for
+from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS, remedy_for
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault
 
@@ -32,7 +32,7 @@ def _picture_fault(file: SceneFile, name: str, text: str) -> str | None:
     try:
         with file_threads():
             file.mi.Bitmap(str(file.resolve(name)))
-    except RuntimeError as error:
+    except MITSUBA_ERRORS as error:
         said = " ".join(str(error).split()).rpartition("] ")[2].strip(" .!")
         return f"{said}; {remedy_for(said)}" if said and said in " ".join(text.split()) else None
     return None
