@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import fast_simplification
 import numpy as np
 import pytest
 import trimesh
 
+from fd_mitsuba.export.bake.tangents import vertex_normals
+from fd_mitsuba.export.final_surface.final_part import FinalPart
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.runs.pipeline import _within_budget
@@ -45,6 +49,11 @@ def test_enough_is_left_as_it_is() -> None:
     assert decimated(solid, len(solid.faces)) is solid and decimated(solid, 10**6) is solid
 
 
+def within_budget(name: str, solid: Solid, faces: int, say: Callable[[str], None]) -> Solid:
+    normals = vertex_normals(solid.vertices, solid.faces)
+    return _within_budget(name, FinalPart(solid, normals, np.zeros(len(solid.vertices))), faces, say).solid
+
+
 def test_what_cannot_be_made_smaller_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def torn(points: np.ndarray, faces: np.ndarray, **_: object) -> tuple[np.ndarray, np.ndarray]:
         return points, faces[:100]
@@ -52,13 +61,13 @@ def test_what_cannot_be_made_smaller_is_told(monkeypatch: pytest.MonkeyPatch) ->
     said: list[str] = []
     monkeypatch.setattr(fast_simplification, "simplify", torn)
     solid = ball()
-    assert _within_budget("wing", solid, 1000, said.append) is solid
+    assert within_budget("wing", solid, 1000, said.append) is solid
     assert len(said) == 1 and f"part 'wing' keeps {len(solid.faces)} faces" in said[0]
 
 
 def test_a_shape_that_needs_more_faces_gets_them_and_that_is_told() -> None:
     said: list[str] = []
-    small = _within_budget("leaves", leaves(), 100, said.append)
+    small = within_budget("leaves", leaves(), 100, said.append)
     assert small.manifold and 100 < len(small.faces) < 1000
     assert said == [f"--faces 100: part 'leaves' keeps {len(small.faces)} faces; with fewer it would fall apart"]
 
@@ -66,7 +75,7 @@ def test_a_shape_that_needs_more_faces_gets_them_and_that_is_told() -> None:
 def test_a_shape_that_suffers_is_told() -> None:
     said: list[str] = []
     ring = trimesh.creation.torus(0.3, 0.05, 120, 40)
-    small = _within_budget("ring", Solid(ring.vertices, ring.faces), 150, said.append)
+    small = within_budget("ring", Solid(ring.vertices, ring.faces), 150, said.append)
     assert len(small.faces) <= 150 and len(said) == 1 and "of its volume left" in said[0]
-    _within_budget("wing", ball(level=5), 2000, said.append)
+    within_budget("wing", ball(level=5), 2000, said.append)
     assert len(said) == 1
