@@ -13,10 +13,10 @@ import pytest
 import torch
 from PIL import Image
 
-from fd_mitsuba import cost_memory
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError, out_of_memory
+from fd_mitsuba.runs import cost_memory
 from fd_mitsuba.runs.cost_memory import SceneSize, check_memory_mb, memory_warning, refuse_too_many_samples, run_memory
 from fd_mitsuba.scene.edit_scene import load_edit_scene
 
@@ -139,7 +139,7 @@ def test_a_failed_allocation_is_one_line(
 ) -> None:
     """Within the steps, before the first checkpoint: no folder is left, so the same command can be repeated."""
     monkeypatch.setattr("fd_mitsuba.training.geometry_stage.GeometryStage.step", lambda *_: np.empty(10**15))
-    words = ["run", str(make_scene()), "-q", "-o", str(tmp_path / "out"), "--stage", "geometry"]
+    words = ["run", str(make_scene()), "-c", "quick", "-q", "-o", str(tmp_path / "out"), "--stage", "geometry"]
     assert main([*words, "--set", "geometry.lambda_sds=0", "--set", "geometry.grid_resolution=16"]) == 1
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and "out of memory" in error and "Unable to allocate" in error

@@ -11,6 +11,7 @@ import trimesh
 from conftest import write_ply
 
 from fd_mitsuba.config import GeometryConfig, OutputConfig, RunConfig
+from fd_mitsuba.export.final_surface.final_part import final_parts
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.runs.geometry_outcome import export_geometry
 from fd_mitsuba.runs.own_meshes import base_mesh, creased, edited_mesh, start_mesh
@@ -95,7 +96,7 @@ def test_a_run_shows_them(make_scene: Make, tmp_path: Path) -> None:
 
     scene = load_edit_scene(make_scene())
     stage = GeometryStage(scene, CONFIG, None)
-    export_geometry(stage, tmp_path / "run")
+    export_geometry(stage, tmp_path / "run", final_parts(stage, CONFIG.output.faces))
     sheet = np.asarray(Image.open(tmp_path / "run" / "images" / "turntable.png").convert("RGB"))
     row = np.concatenate(list(render_ring(base_mesh(scene), 8, 64, stage.aim)), axis=1)
     np.testing.assert_array_equal(sheet[18 : 18 + 64, : 8 * 64], row)

@@ -19,7 +19,7 @@ def add_names_command(commands: argparse._SubParsersAction) -> None:
 
 
 def _names(options: argparse.Namespace) -> int:
-    config = chosen_settings(options) if options.config or options.overrides else None
+    config = chosen_settings(options).config if options.config or options.overrides else None
     options.plugins = list(options.plugins if config is None else config.plugins)
     start(options)
     from fd_mitsuba.runs.choices import checked_choices, described
