@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 from torch.nn.functional import avg_pool2d
 
 from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
-from fd_mitsuba.guidance.vocabulary import Vocabulary, read_prompt
+from fd_mitsuba.guidance.prompt_reader import read_prompt
+from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.prior.data import captions as coarse_captions
 from fd_mitsuba.prior.data.body import Body
 from fd_mitsuba.prior.data.fine.bodies import BODIES, NAMELESS
