@@ -57,6 +57,8 @@ def load_scene(
         prompt: in place of the scene's.
         regions: an XML file with focal regions, such as for a scene that was exported.
         threads: cores to use; 0: all; 1: results that are the same bytes at every run. Import torch after this call.
+            With 1, and with 0 on two cores, Dr.Jit keeps a single thread, and Mitsuba 3.9 then waits forever when your
+            own code reads or writes an EXR: do that within `fd_mitsuba.backend.file_threads.file_threads()`.
         variant: Mitsuba's.
         on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
         plugins: modules or .py files to import first, which register what the scene names; see docs/extending.md.

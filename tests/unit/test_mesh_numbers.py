@@ -10,6 +10,7 @@ import pytest
 from cases import CASES
 from pygltflib import GLTF2
 
+from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
@@ -178,7 +179,8 @@ def test_a_picture_above_one_is_refused(tmp_path: Path, mi: Any) -> None:
     for name in ("m.ply", "scene.xml"):
         text = (path / name).read_bytes().replace(b"tex.png", b"tex.exr")
         (tmp_path / name).write_bytes(text)
-    mi.Bitmap(values).write(str(tmp_path / "tex.exr"))
+    with file_threads():
+        mi.Bitmap(values).write(str(tmp_path / "tex.exr"))
     with pytest.raises(UserError, match=r"base_color reads tex.exr, whose values go up to 3.5"):
         check_appearance_inputs(load_edit_scene(tmp_path / "scene.xml"))
     values[:] = 0.5
@@ -186,7 +188,8 @@ def test_a_picture_above_one_is_refused(tmp_path: Path, mi: Any) -> None:
     values = np.tile(values, (4, 4, 1))
     values[:16] = np.minimum(values[:16], 1)
     values[:, :24] = np.minimum(values[:, :24], 1)
-    mi.Bitmap(values).write(str(tmp_path / "tex.exr"))
+    with file_threads():
+        mi.Bitmap(values).write(str(tmp_path / "tex.exr"))
     assert "clamp them to 1" in "".join(check_appearance_inputs(load_edit_scene(tmp_path / "scene.xml")))
 
 

@@ -7,35 +7,28 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from fd_mitsuba.config.bounds import (
+    MOST_SAMPLES,
+    MOST_TURNTABLE_PIXELS,
+    Cells,
+    Features,
+    Fraction,
+    GuidanceScale,
+    Length,
+    Levels,
+    Neurons,
+    Points,
+    Range,
+    Rate,
+    Samples,
+    Steps,
+    Views,
+    Weight,
+    Width,
+)
 from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
 from fd_mitsuba.conventions import TextureChannel, Weighting
-
-# Every number has an upper bound, far above what makes sense: what lies beyond ends in an overflow, in more memory
-# than there is or in a loop without end, hours later and in words that name no setting.
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Weight = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-GuidanceScale = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
-Length = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
-"""In canonical units, in which the base's longest side is 1.8."""
-Width = Annotated[float, Field(ge=1e-6, le=10, allow_inf_nan=False)]
-"""A length that is divided by."""
-Rate = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
-Steps = Annotated[int, Field(ge=1, le=1_000_000)]
-Views = Annotated[int, Field(ge=1, le=64)]
-Samples = Annotated[int, Field(ge=1, le=4096)]
-"""Samples a pixel."""
-Points = Annotated[int, Field(ge=1, le=10_000_000)]
-Levels = Annotated[int, Field(ge=1, le=32)]
-Features = Annotated[int, Field(ge=1, le=16)]
-Neurons = Annotated[int, Field(ge=1, le=1024)]
-Cells = Annotated[int, Field(ge=1, le=1 << 20)]
-"""Cells a side of one level of a hash grid."""
-Range = tuple[float, float]
-MOST_SAMPLES = 2**32 - 1
-"""What Dr.Jit can number in one array."""
-MOST_TURNTABLE_PIXELS = 10**9
-"""All frames of a turntable are in memory at once, three bytes a pixel."""
 
 
 class Section(BaseModel):

@@ -13,7 +13,7 @@ def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = ""
     """The reading of a prompt that asks for a part that the model knows.
 
     Raises:
-        UserError: it asks for none, or only says what shall not be there.
+        UserError: it asks for none, or only names what to leave away.
     """
     reading = read_prompt(prompt, vocabulary, base_prompt)
     if reading.parts:
@@ -21,8 +21,8 @@ def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = ""
     if reading.removed and not reading.unknown_parts:
         off = ", ".join(map(repr, reading.removed))
         raise UserError(
-            f"prompt {prompt!r}: asks for no part, only for no {off}, and the built-in prior adds; say what shall be "
-            'added, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
+            f"prompt {prompt!r}: asks for no part, only for no {off}, and the built-in prior adds; name what to "
+            'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
             "geometry.lambda_sds=0"
         )
     hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)

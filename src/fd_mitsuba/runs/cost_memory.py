@@ -13,7 +13,8 @@ from pathlib import Path
 from PIL import Image
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.config.sections import MOST_SAMPLES, FieldConfig, OutputConfig, TextureConfig
+from fd_mitsuba.config.bounds import MOST_SAMPLES
+from fd_mitsuba.config.sections import FieldConfig, OutputConfig, TextureConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import available_bytes, held_bytes

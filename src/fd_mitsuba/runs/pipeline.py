@@ -108,111 +108,89 @@ def run(
     """
     refuse_strange_folder(folder)
     with run_lock(folder, say):
-        return _run(
-            scene, config, folder, resume, command, quiet, say, stages, geometry_from, guidance, on_step, opening, judge
-        )
-
-
-def _run(
-    scene: EditScene,
-    config: RunConfig,
-    folder: Path,
-    resume: bool,
-    command: str,
-    quiet: bool,
-    say: Callable[[str], None],
-    stages: Collection[str],
-    geometry_from: Path | None,
-    guidance: Guidance | None,
-    on_step: OnStep | None,
-    opening: Sequence[str],
-    judge: Judge | None,
-) -> dict:
-    started = time.monotonic()
-    config = checked_choices(config)
-    for warning in scene.warnings:
-        say(warning)
-    refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
-    asked, with_assets = stages, "appearance" in stages
-    diffusion = config.guidance.kind.kind == "diffusion"
-    by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(guidance, "guide_appearance")
-    if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and by_builtin:
-        if "geometry" not in stages:
-            raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
-        say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
-        stages = ("geometry",)
-    with_geometry = "geometry" in stages and geometry_from is None
-    for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
-        say(line)
-    size, weights = SceneSize.of(scene), unet_weights(config.guidance.model)[0]
-    if warning := memory_warning(scene, run_memory(size, config, tuple(stages), weights)):
-        say(warning)
-    # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
-    for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None
-    for_appearance = None
-    if "appearance" in stages:
-        # Both priors know the same words: what the geometry stage has said of them is not said again.
-        listener = (lambda line: None) if for_geometry is not None else say
-        loaded = for_geometry if guidance is None else None
-        for_appearance = prepare_appearance(scene, config, say, listener, loaded, guidance)
-
-    def begin() -> None:
-        for line in opening:
+        started = time.monotonic()
+        config = checked_choices(config)
+        refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
+        asked, with_assets = stages, "appearance" in stages
+        diffusion = config.guidance.kind.kind == "diffusion"
+        by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(guidance, "guide_appearance")
+        if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and by_builtin:
+            if "geometry" not in stages:
+                raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
+            say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
+            stages = ("geometry",)
+        with_geometry = "geometry" in stages and geometry_from is None
+        for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
             say(line)
-        describe_run(scene, config, folder, command)
+        size, weights = SceneSize.of(scene), unet_weights(config.guidance.model)[0]
+        if warning := memory_warning(scene, run_memory(size, config, tuple(stages), weights)):
+            say(warning)
+        # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
+        for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None
+        for_appearance = None
+        if "appearance" in stages:
+            # Both priors know the same words: what the geometry stage has said of them is not said again.
+            listener = (lambda line: None) if for_geometry is not None else say
+            loaded = for_geometry if guidance is None else None
+            for_appearance = prepare_appearance(scene, config, say, listener, loaded, guidance)
 
-    if with_geometry:
-        geometry = GeometryStage(scene, config, for_geometry)
-        with discarded_without_checkpoint(folder):
+        def begin() -> None:
+            for line in (*opening, *scene.warnings):
+                say(line)
+            describe_run(scene, config, folder, command)
+
+        if with_geometry:
+            geometry = GeometryStage(scene, config, for_geometry)
+            with discarded_without_checkpoint(folder):
+                begin()
+                run_stage(geometry, folder, resume, quiet, say, on_step)
+        elif geometry_from is not None:
+            refuse_other_shape(saved_run(geometry_from, say=say)[0], scene, geometry_from)
+            geometry = load_finished_stage(scene, config, geometry_from)
+            with discarded_without_checkpoint(folder):
+                begin()
+                take_geometry(geometry_from, folder)
+        else:
+            geometry = load_finished_stage(scene, config, folder)
             begin()
-            run_stage(geometry, folder, resume, quiet, say, on_step)
-    elif geometry_from is not None:
-        refuse_other_shape(saved_run(geometry_from, say=say)[0], scene, geometry_from)
-        geometry = load_finished_stage(scene, config, geometry_from)
-        with discarded_without_checkpoint(folder):
-            begin()
-            take_geometry(geometry_from, folder)
-    else:
-        geometry = load_finished_stage(scene, config, folder)
-        begin()
-    with rendering_threads():
-        finished = final_parts(geometry, config.output.faces, say)
-        metrics = export_geometry(geometry, folder, finished)
-    if guidance is not None:
-        metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
-    verdict = None
-    if judge is not None:
         with rendering_threads():
-            verdict = judge(geometry, say)
-    if verdict is not None:
-        metrics["verdict"] = verdict.to_json()
+            finished = final_parts(geometry, config.output.faces, say)
+            metrics = export_geometry(geometry, folder, finished)
+        if guidance is not None:
+            metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
+        verdict = None
+        if judge is not None:
+            with rendering_threads():
+                verdict = judge(geometry, say)
+        if verdict is not None:
+            metrics["verdict"] = verdict.to_json()
 
-    def write_metrics() -> None:
-        metrics["seconds"] = round(time.monotonic() - started, 1)
-        metrics["peak_memory_mb"] = peak_memory_mb()
-        write_json(folder / "metrics.json", metrics)
+        def write_metrics() -> None:
+            metrics["seconds"] = round(time.monotonic() - started, 1)
+            metrics["peak_memory_mb"] = peak_memory_mb()
+            write_json(folder / "metrics.json", metrics)
 
-    write_metrics()
-    field = None
-    if "appearance" in stages:
-        appearance = AppearanceStage(
-            scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
-        )
-        run_stage(appearance, folder, resume, quiet, say, on_step)
-        with rendering_threads():
-            field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
         write_metrics()
-    if with_assets:
-        with rendering_threads():
-            write_assets(geometry, finished, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
-    metrics["warnings"] = outcome_warnings(metrics)
-    # Written last of all: a folder without it is not finished.
-    done = {"geometry", *stages}
-    metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}
-    write_metrics()
-    if verdict is not None:
-        say(verdict.line())
-    return metrics
+        field = None
+        if "appearance" in stages:
+            appearance = AppearanceStage(
+                scene, config, parts_of_run(scene, folder), for_appearance, say, opened_base(scene, folder)
+            )
+            run_stage(appearance, folder, resume, quiet, say, on_step)
+            with rendering_threads():
+                field, metrics["appearance"] = appearance.field, write_appearance(appearance, folder)
+            write_metrics()
+        if with_assets:
+            with rendering_threads():
+                write_assets(geometry, finished, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+        metrics["warnings"] = outcome_warnings(metrics)
+        # Written last of all: a folder without it is not finished.
+        done = {"geometry", *stages}
+        metrics["stages"] = {name: "done" if name in done else "left out" for name in STAGES if name in {*done, *asked}}
+        write_metrics()
+        if verdict is not None:
+            say(verdict.line())
+        return metrics
 
 
 def export_run(

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.config import AppearanceConfig, RunConfig, Section
+from fd_mitsuba.config.bounds import Points, Width
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import Registry
-from fd_mitsuba.config.sections import Points, Width
 from fd_mitsuba.fields.texture import TextureField, TextureValues
 from fd_mitsuba.losses.bend import loss_bend
 from fd_mitsuba.losses.style import jittered, loss_style_boundary, loss_style_gradient

@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from fd_mitsuba.config import GeometryConfig, Section
+from fd_mitsuba.config.bounds import Length, Width
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import Registry
-from fd_mitsuba.config.sections import Length, Width
 from fd_mitsuba.losses.collision import loss_collision
 from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.losses.presence import loss_presence

@@ -13,7 +13,7 @@ import imageio.v3 as imageio
 import numpy as np
 from PIL import Image
 
-from fd_mitsuba.config.sections import MOST_TURNTABLE_PIXELS
+from fd_mitsuba.config.bounds import MOST_TURNTABLE_PIXELS
 
 MOST_FRAMES = 48
 _CAPTION, _SHEET_VIEWS = 18, 8  # as `turntable.write_sheet` and its callers have them

@@ -3,7 +3,7 @@
 The training marches a grid whose cells are as large as what a picture of 32 pixels can show. Its field is smooth
 beyond that; what looked torn was the marching. Here the same solid is
 
-1. sampled on a lattice three times finer, around its surface only, and marched (`fine_lattice`);
+1. sampled on a lattice two to four times finer, around its surface only, and marched (`fine_lattice`);
 2. remeshed into triangles of one size, every vertex on the function's zero set (`remesh`, `projection`);
 3. given that function's gradient for its normals.
 
@@ -122,7 +122,7 @@ def part_function(stage: GeometryStage, coarse: LatticePart, factor: int) -> Par
     """The function of space whose zero set is the part's solid, bridges included.
 
     Args:
-        factor: how many times finer than the training's a lattice for the part's own surface shall be.
+        factor: how many times finer than the training's a lattice for the part's own surface is.
     """
     scene, geometry, grid = stage.scene, stage.config.geometry, coarse.grid
     base = None if coarse.cuts else MeshDistance(scene.base_canonical.vertices, scene.base_canonical.faces)

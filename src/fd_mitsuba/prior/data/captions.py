@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 BODY_WORDS: dict[str, tuple[str, ...]] = {
@@ -127,13 +129,22 @@ def view_words(azimuth_deg: float, closeup: bool) -> str:
 
 def word_lists() -> dict[str, dict | list[str]]:
     """The vocabulary as `guidance.vocabulary.Vocabulary` reads it: what a user may write in a prompt."""
-    phrases = {word for words in (*BODY_WORDS.values(), *PART_WORDS.values()) for word in words}
-    camera_words = {*AZIMUTH_WORDS, CLOSEUP_WORD}
+    return listed_words(BODY_WORDS, PART_WORDS, SYNONYM_WHOLES, vocabulary())
+
+
+def listed_words(
+    bodies: Mapping[str, Sequence[str]],
+    parts: Mapping[str, Sequence[str]],
+    wholes: Mapping[tuple[str, str], Sequence[str]],
+    words: Sequence[str],
+) -> dict[str, dict | list[str]]:
+    """`word_lists` of any vocabulary `words`; `wholes` maps (body, part) to words for both together."""
+    phrases = {word for group in (*bodies.values(), *parts.values()) for word in group}
     return {
-        "bodies": {name: list(words) for name, words in BODY_WORDS.items()},
-        "parts": {name: list(words) for name, words in PART_WORDS.items()},
-        "wholes": {whole: part for (_, part), wholes in SYNONYM_WHOLES.items() for whole in wholes},
-        "words": [word for word in vocabulary() if word not in phrases | camera_words],
+        "bodies": {name: list(group) for name, group in bodies.items()},
+        "parts": {name: list(group) for name, group in parts.items()},
+        "wholes": {whole: part for (_, part), group in wholes.items() for whole in group},
+        "words": [word for word in words if word not in phrases | {*AZIMUTH_WORDS, CLOSEUP_WORD}],
     }
 
 

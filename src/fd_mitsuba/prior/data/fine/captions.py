@@ -131,14 +131,7 @@ STYLED_SHARE = 0.2
 
 def word_lists() -> dict[str, dict | list[str]]:
     """The vocabulary as `guidance.vocabulary.Vocabulary` reads it: what a user may write in a prompt."""
-    phrases = {word for words in (*BODY_WORDS.values(), *PART_WORDS.values()) for word in words}
-    camera_words = {*AZIMUTH_WORDS, CLOSEUP_WORD}
-    return {
-        "bodies": {name: list(words) for name, words in BODY_WORDS.items()},
-        "parts": {name: list(words) for name, words in PART_WORDS.items()},
-        "wholes": {whole: part for (_, part), wholes in SYNONYM_WHOLES.items() for whole in wholes},
-        "words": [word for word in vocabulary() if word not in phrases | camera_words],
-    }
+    return coarse.listed_words(BODY_WORDS, PART_WORDS, SYNONYM_WHOLES, vocabulary())
 
 
 def vocabulary() -> list[str]:
