@@ -55,3 +55,15 @@ print(os.environ["OMP_WAIT_POLICY"], torch.get_num_threads(), inside, drjit.thre
     environment.pop("OMP_WAIT_POLICY", None)
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["PASSIVE", "1", str(network), str(renderer)], done.stderr
+
+
+def test_lone_threads_stay_alone_when_another_thread_takes_more() -> None:
+    before = torch.get_num_threads()
+    try:
+        with threads.lone_threads(1) as lone:
+            lone.submit(int).result()  # the thread is there, but torch has done nothing in it yet
+            torch.set_num_threads(before + 1)
+            assert lone.submit(torch.get_num_threads).result() == 1
+            assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)

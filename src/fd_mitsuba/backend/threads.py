@@ -20,6 +20,7 @@ import contextlib
 import ctypes
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT, start
@@ -84,6 +85,26 @@ def cores_in_use() -> int:
 def renderer_threads(cores: int) -> int:
     """Dr.Jit's share of `cores`."""
     return 1 if cores <= _FEW_CORES else cores - 1
+
+
+def lone_threads(count: int) -> ThreadPoolExecutor:
+    """`count` threads in each of which torch works alone, whatever other threads ask of it meanwhile.
+
+    >>> import torch
+    >>> with lone_threads(1) as threads:
+    ...     threads.submit(torch.get_num_threads).result()
+    1
+    """
+    return ThreadPoolExecutor(count, initializer=_work_alone)
+
+
+def _work_alone() -> None:
+    import torch
+
+    # A thread takes the process's latest number over at its first operation: without that being done here, a number
+    # that another thread sets between now and then would be this one's too.
+    torch.get_num_threads()
+    torch.set_num_threads(1)
 
 
 @contextmanager

@@ -8,11 +8,12 @@ networks are left as they are: each thread would read all the weights.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import torch
 from torch import Tensor, nn
+
+from fd_mitsuba.backend.threads import lone_threads
 
 _SMALL = 100_000_000
 """Weights of a network below which its samples are shared out."""
@@ -46,9 +47,8 @@ def of_samples(call: Callable[..., Tensor], inputs: Sequence[Tensor], most: int,
         with torch.set_grad_enabled(with_gradient):
             return call(*piece)
 
-    return torch.cat(list(_lone_threads(workers).map(work, pieces)))
+    return torch.cat(list(_threads(workers).map(work, pieces)))
 
 
-@cache
-def _lone_threads(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+_threads = cache(lone_threads)
+"""By their number: the same ones serve all calls."""

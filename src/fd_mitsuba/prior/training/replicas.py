@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
+
+from fd_mitsuba.backend.threads import lone_threads
 
 
 class Replicas:
@@ -26,7 +27,7 @@ class Replicas:
 
     def __init__(self, modules: torch.nn.ModuleDict, count: int) -> None:
         self._modules = [modules, *(_sharing_weights(modules) for _ in range(count - 1))]
-        self._threads = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
+        self._threads = lone_threads(count)
 
     def backward(self, part: Callable[[torch.nn.ModuleDict, slice], tuple[torch.Tensor, Any]], size: int) -> list[Any]:
         """Accumulate the gradient of the mean over a batch of `size` samples.
