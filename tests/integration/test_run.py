@@ -221,7 +221,7 @@ def test_finished_stage_can_be_loaded(finished: Path, place: Path) -> None:
     config = RunConfig.load(place / "tiny.toml", [f"guidance.model={place / 'sd15'}"])
     stage = load_finished_stage(scene, config, finished)
     metrics = json.loads((finished / "metrics.json").read_text())
-    assert len(final_part(stage, "part", config.output.faces).solid.faces) == metrics["part_faces"]["part"]
+    assert len(final_part(stage.grown(), "part", config.output.faces).solid.faces) == metrics["part_faces"]["part"]
 
 
 def test_interrupted_and_resumed_gives_the_same_bytes(finished: Path, place: Path) -> None:

@@ -28,7 +28,7 @@ def test_shipped_scenes(resolution: int, tmp_path: Path) -> None:
     for path in SCENES:
         scene = load_edit_scene(path)
         stage = GeometryStage(scene, config, None)
-        solids = {name: part_solid(stage, name) for name in scene.parts}
+        solids = {name: part_solid(stage.grown(), name) for name in scene.parts}
         parts = {name: PartAsset(scene.frame.to_user(s.vertices), s.faces, field) for name, s in solids.items()}
         assert all(len(solid.faces) > 100 for solid in solids.values()), path
         export_assets(scene, config, parts, tmp_path / path.parent.name, ["glb"], texture_size=64)

@@ -35,7 +35,7 @@ def test_shipped_scene(path: Path) -> None:
         assert (piece.status() == manifold3d.Error.NoError) == closed
         whole = whole + piece if closed and whole is not None else None
     for name in scene.parts:
-        final = final_part(stage, name, 20_000)
+        final = final_part(stage.grown(), name, 20_000)
         solid = final.solid
         assert np.percentile(smallest_angles(solid.vertices, solid.faces), 5) > 25
         assert final.distance.mean() < 0.02 * stage.grid.spacing

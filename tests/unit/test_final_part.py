@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import manifold3d
 import numpy as np
 import pytest
 import torch
-from test_part_solid import BASE_RADIUS, ball_volume, check, lens, stage_of
+from test_part_solid import BASE_RADIUS, ball_volume, check, fresh_extractor, lens, stage_of
 from test_surface_quality import BOX
 
 from fd_mitsuba.evaluation.joint import measure_joint
@@ -17,27 +17,20 @@ from fd_mitsuba.evaluation.surface_quality import smallest_angles
 from fd_mitsuba.export.final_surface import final_part as module
 from fd_mitsuba.export.final_surface.final_part import FinalPart, final_part, final_parts
 from fd_mitsuba.export.solid.part_solid import SINK_CELLS, part_solid
+from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
+from fd_mitsuba.extraction.surface import SurfaceExtractor
 from fd_mitsuba.fields.part_sdf import PartField, PartValues
 from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 FACES = 4000
 CENTRE, RADIUS = np.array([0.0, 0.62, 0.0]), 0.25
 
 
-def stage_with_base(*arguments: object, **options: object) -> SimpleNamespace:
-    """`stage_of`, and the base's surface, which the final one is measured against."""
-    stage = stage_of(*arguments, **options)  # type: ignore[arg-type]
-    vertices, faces = unit_sphere(5)
-    stage.scene.base_canonical = TriangleMesh("base", vertices * BASE_RADIUS, faces)
-    return stage
-
-
-def one_ball(k: float = 0.15) -> SimpleNamespace:
-    return stage_with_base({"part": [(tuple(CENTRE), RADIUS)]}, k=k)
+def one_ball(k: float = 0.15) -> GrownPart:
+    return stage_of({"part": [(tuple(CENTRE), RADIUS)]}, k=k)
 
 
 def outside(part: FinalPart) -> np.ndarray:
@@ -110,7 +103,7 @@ def test_the_fillet_is_as_high_as_the_unions_and_has_no_crease() -> None:
 
 def test_the_joint_is_one_smooth_circle() -> None:
     stage = one_ball()
-    base = MeshDistance(stage.scene.base_canonical.vertices, stage.scene.base_canonical.faces)
+    base = MeshDistance(stage.base.vertices, stage.base.faces)
     spacing = stage.grid.spacing
     joint = measure_joint(*(lambda s: (s.vertices, s.faces))(final_part(stage, None, FACES).solid), base, spacing)
     before = measure_joint(*(lambda s: (s.vertices, s.faces))(part_solid(stage, None)), base, spacing)
@@ -120,11 +113,11 @@ def test_the_joint_is_one_smooth_circle() -> None:
 
 
 def test_a_gap_is_bridged_as_the_grid_has_decided() -> None:
-    stage = stage_with_base({"part": [((0.0, BASE_RADIUS + 0.08 + 0.2, 0.0), 0.2)]})
+    stage = stage_of({"part": [((0.0, BASE_RADIUS + 0.08 + 0.2, 0.0), 0.2)]})
     part = final_part(stage, None, FACES)
     check(part.solid)
     assert part.solid.bridged == part_solid(stage, None).bridged > 0
-    assert part.solid.gap(stage.scene.base_canonical) == 0.0 and part.solid.pieces().max() == 0
+    assert part.solid.gap(stage.base) == 0.0 and part.solid.pieces().max() == 0
     far = part.solid.vertices[:, 1] > BASE_RADIUS + 0.08 + 2 * part.solid.bridged + stage.grid.spacing
     away = np.linalg.norm(part.solid.vertices[far] - [0, BASE_RADIUS + 0.28, 0], axis=1) - 0.2
     assert far.sum() > 50 and np.abs(away).max() < 1e-3
@@ -132,10 +125,10 @@ def test_a_gap_is_bridged_as_the_grid_has_decided() -> None:
 
 def test_islands_go_and_what_floats_stays() -> None:
     balls = [((0.0, 0.62, 0.0), 0.25), ((0.8, 0.6, 0.0), 0.04), ((-0.8, 0.6, 0.0), 0.04)]
-    solid = final_part(stage_with_base({"part": balls}), None, FACES).solid
+    solid = final_part(stage_of({"part": balls}), None, FACES).solid
     check(solid)
     assert solid.islands_removed == 2 and np.abs(solid.vertices[:, 0]).max() < 0.5
-    floating = final_part(stage_with_base({"part": [((0.0, 0.85, 0.0), 0.15)]}), None, FACES).solid
+    floating = final_part(stage_of({"part": [((0.0, 0.85, 0.0), 0.15)]}), None, FACES).solid
     assert floating.volume == pytest.approx(ball_volume(0.15), rel=0.005)
 
 
@@ -148,20 +141,19 @@ class Hollow(PartField):
 
 
 def test_pockets_are_filled() -> None:
-    stage = stage_with_base({"part": [((0.0, 0.75, 0.0), 0.25)]})
+    stage = stage_of({"part": [((0.0, 0.75, 0.0), 0.25)]})
     full = final_part(stage, None, FACES).solid
     values, positions = stage.extractor.lattice_values(stage.field)
     hollow = torch.minimum(values, (positions - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1) - 0.1)
     stage.extractor.lattice_values = lambda field: (hollow, positions)
-    stage.field = Hollow()
-    solid = final_part(stage, None, FACES).solid
+    solid = final_part(replace(stage, field=Hollow()), None, FACES).solid
     check(solid)
     assert solid.volume == pytest.approx(full.volume, rel=1e-3)
 
 
 def test_named_parts_are_solids_of_their_own_and_fill_the_whole() -> None:
     balls = {"left": [((-0.15, 0.6, 0.0), 0.22)], "right": [((0.15, 0.6, 0.03), 0.22)]}
-    stage = stage_with_base(balls)
+    stage = stage_of(balls)
     parts, whole = final_parts(stage, FACES), final_part(stage, None, FACES).solid
     left, right = parts["left"].solid, parts["right"].solid
     for solid in (left, right, whole):
@@ -172,10 +164,8 @@ def test_named_parts_are_solids_of_their_own_and_fill_the_whole() -> None:
 
 def test_a_part_that_is_cut_out_is_the_ball_itself() -> None:
     stage = one_ball()
-    stage.extractor = SubtractionExtractor(
-        stage.grid, stage.sdf_base, stage.region_sdf, stage.extractor.active_index, 0.15
-    )
-    part = final_part(stage, None, FACES)
+    cutting = replace(stage, extractor=fresh_extractor(stage.extractor, SubtractionExtractor))
+    part = final_part(cutting, None, FACES)
     check(part.solid)
     assert part.solid.volume == pytest.approx(ball_volume(RADIUS), rel=0.005)
     assert np.abs(np.linalg.norm(part.solid.vertices - CENTRE, axis=1) - RADIUS).max() < 1e-4
@@ -186,11 +176,10 @@ def test_edges_of_a_box_stay() -> None:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.2 + [0, 0.8, 0]
     stage = one_ball(k=0.0)
     box = FocalRegion("part", np.eye(4), "part", TriangleMesh("box", corners, np.array(BOX)))
-    stage.scene.parts = {"part": (box,)}
-    stage.region_sdf = torch.from_numpy(union_sdf([box], stage.grid.vertices.numpy()))
-    active = (stage.region_sdf > -0.15).nonzero()[:, 0]
-    stage.extractor = type(stage.extractor)(stage.grid, stage.sdf_base, stage.region_sdf, active, 0.0)
-    solid = final_part(stage, None, 20_000).solid
+    region_sdf = torch.from_numpy(union_sdf([box], stage.grid.vertices.numpy()))
+    active = (region_sdf > -0.15).nonzero()[:, 0]
+    extractor = SurfaceExtractor(stage.grid, stage.extractor.sdf_base, region_sdf, active, 0.0)
+    solid = final_part(replace(stage, parts={"part": (box,)}, extractor=extractor), None, 20_000).solid
     check(solid)
     along = np.linspace(0.62, 0.98, 200)
     edge = np.stack([np.full(200, 0.2), along, np.full(200, 0.2)], axis=1)

@@ -86,7 +86,7 @@ def ball(folder: Path, scale: float = 1.0, kind: str = "ply", away: np.ndarray |
 def grown(scene: EditScene, folder: Path) -> trimesh.Trimesh:
     """The part at the start of a run, as its PLY says."""
     config = RunConfig(geometry=GeometryConfig(grid_resolution=24, steps=2))
-    solid = part_solid(GeometryStage(scene, config, None), "part")
+    solid = part_solid(GeometryStage(scene, config, None).grown(), "part")
     write_mesh(folder / "part.ply", solid.vertices, solid.faces, scene)
     return trimesh.load(folder / "part.ply", process=False)
 
@@ -150,7 +150,9 @@ def test_exports_far_away_are_the_near_ones_moved(tmp_path: Path, mi: Any) -> No
     for name, away in (("near", np.zeros(3)), ("far", AWAY)):
         (tmp_path / name).mkdir()
         scene = load_edit_scene(ball(tmp_path / name, away=away))
-        solid = part_solid(GeometryStage(scene, RunConfig(geometry=GeometryConfig(grid_resolution=24)), None), "part")
+        solid = part_solid(
+            GeometryStage(scene, RunConfig(geometry=GeometryConfig(grid_resolution=24)), None).grown(), "part"
+        )
         part = PartAsset(scene.frame.to_user(solid.vertices), solid.faces)
         export_assets(scene, RunConfig(), {"part": part}, tmp_path / name / "out", texture_size=64)
         glb = GLTF2().load(str(tmp_path / name / "out/asset.glb"))

@@ -61,7 +61,7 @@ def test_away_from_the_part_before_and_after_are_equal(make_scene: Make) -> None
     """To the last bit, in normals and outline: nothing there may look as if it had changed."""
     scene = load_edit_scene(make_scene())
     stage = GeometryStage(scene, CONFIG, None)
-    part = part_solid(stage, None)
+    part = part_solid(stage.grown(), None)
     before = render_ring(base_mesh(scene), 6, 96, stage.aim)
     after = render_ring(edited_mesh(scene, part, None), 6, 96, stage.aim)
     alone = render_ring((torch.from_numpy(part.vertices).float(), torch.from_numpy(part.faces)), 6, 96, stage.aim)
@@ -96,7 +96,7 @@ def test_a_run_shows_them(make_scene: Make, tmp_path: Path) -> None:
 
     scene = load_edit_scene(make_scene())
     stage = GeometryStage(scene, CONFIG, None)
-    export_geometry(stage, tmp_path / "run", final_parts(stage, CONFIG.output.faces))
+    export_geometry(stage, tmp_path / "run", final_parts(stage.grown(), CONFIG.output.faces))
     sheet = np.asarray(Image.open(tmp_path / "run" / "images" / "turntable.png").convert("RGB"))
     row = np.concatenate(list(render_ring(base_mesh(scene), 8, 64, stage.aim)), axis=1)
     np.testing.assert_array_equal(sheet[18 : 18 + 64, : 8 * 64], row)

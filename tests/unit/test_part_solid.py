@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import igl
 import manifold3d
@@ -13,13 +13,14 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from fd_mitsuba.config import FieldConfig, GeometryConfig
+from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.part_record import anchor
 from fd_mitsuba.export.solid.part_pieces import BRIDGE_REACH
 from fd_mitsuba.export.solid.part_solid import SINK_CELLS, fillet_reach, part_solid
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.extraction.active_vertices import active_vertices
+from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.part_sdf import PartField
@@ -31,7 +32,6 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 BASE_RADIUS = 0.5
 NO_OFFSETS = FieldConfig(levels=2, log2_table=8, finest_resolution=16, offsets=False)
 
-Stage = SimpleNamespace
 Balls = dict[str, list[tuple[tuple[float, float, float], float]]]
 
 
@@ -41,24 +41,23 @@ def region(centre: tuple[float, float, float], radius: float, part: str = "part"
     return FocalRegion(part, matrix, part)
 
 
-def stage_of(balls: Balls, resolution: int = 40, k: float = 0.15, base_radius: float = BASE_RADIUS) -> Stage:
-    """What `part_solid` reads of a stage: a ball as the base, and parts that are balls, exactly."""
+def stage_of(balls: Balls, resolution: int = 40, k: float = 0.15, base_radius: float = BASE_RADIUS) -> GrownPart:
+    """A ball as the base, and parts that are balls, exactly."""
     grid = TetGrid(resolution)
     points = grid.vertices
     parts = {name: tuple(region(*ball, name) for ball in list_) for name, list_ in balls.items()}
-    regions = tuple(region for regions in parts.values() for region in regions)
-    sdf_region = torch.from_numpy(union_sdf(regions, points.numpy()))
+    sdf_region = torch.from_numpy(
+        union_sdf([region for regions in parts.values() for region in regions], points.numpy())
+    )
     sdf_base = base_radius - points.norm(dim=1)
     extractor = SurfaceExtractor(grid, sdf_base, sdf_region, active_vertices(grid, sdf_region), k)
-    return SimpleNamespace(
-        grid=grid,
-        sdf_base=sdf_base,
-        region_sdf=sdf_region,
-        extractor=extractor,
-        field=PartField(NO_OFFSETS),
-        config=SimpleNamespace(geometry=GeometryConfig(union_k=k, grid_resolution=resolution)),
-        scene=SimpleNamespace(parts=parts, regions=regions),
-    )
+    return GrownPart(parts, base_mesh(base_radius), extractor, PartField(NO_OFFSETS))
+
+
+def fresh_extractor(known: SurfaceExtractor, kind: type[SurfaceExtractor] = SurfaceExtractor) -> SurfaceExtractor:
+    """Another of the same grid, base and regions, for a field of another layout or for cutting out."""
+    grid, region = known.grid, known.initial_sdf
+    return kind(grid, known.sdf_base, region, active_vertices(grid, region), known.union_k)
 
 
 def base_mesh(radius: float = BASE_RADIUS) -> TriangleMesh:
@@ -259,11 +258,7 @@ def test_moved_vertices_keep_it_manifold() -> None:
         field.grid.table.copy_(0.05 * torch.randn(field.grid.table.shape, generator=generator))
         field.mlp.weight_out.copy_(torch.randn(field.mlp.weight_out.shape, generator=generator))
         field.mlp.weight_out[0] *= 0.1
-    stage.field, stage.extractor = (
-        field,
-        SurfaceExtractor(stage.grid, stage.sdf_base, stage.region_sdf, active_vertices(stage.grid, stage.region_sdf)),
-    )
-    check(part_solid(stage, None))
+    check(part_solid(replace(stage, field=field, extractor=fresh_extractor(stage.extractor)), None))
 
 
 @pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.6, 0.0, 0.8), (-0.48, -0.6, 0.64)])

@@ -135,7 +135,7 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
     base = scene.base_canonical
     locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
     # Parts may join the base through each other, so that their gaps are those of all together.
-    whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage, None)
+    whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage.grown(), None)
     _write_turntable(stage, whole, cut, folder)
     return {
         "version": __version__,

@@ -154,7 +154,7 @@ def run(
             geometry = load_finished_stage(scene, config, folder)
             begin()
         with rendering_threads():
-            finished = final_parts(geometry, config.output.faces, say)
+            finished = final_parts(geometry.grown(), config.output.faces, say)
             metrics = export_geometry(geometry, folder, finished)
         if guidance is not None:
             metrics["guidance_model"] = f"{type(guidance).__module__}.{type(guidance).__qualname__}"
@@ -216,7 +216,7 @@ def export_run(
         geometry = load_finished_stage(scene, config, folder)
         appearance = finished_appearance(scene, config, folder)
         field = None if appearance is None else appearance.field
-        finished = final_parts(geometry, max(faces or 0, config.output.faces), say)
+        finished = final_parts(geometry.grown(), max(faces or 0, config.output.faces), say)
         return write_assets(geometry, finished, field, folder, formats, texture_size, say, faces)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.active_vertices import active_vertices
+from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
 from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
@@ -122,6 +123,10 @@ class GeometryStage:
         """`surface` with what the part starts as, the focal regions or a variation of them, without gradients."""
         with torch.no_grad():
             return self.extractor(PartField(self.config.field.model_copy(update={"offsets": False})))
+
+    def grown(self) -> GrownPart:
+        """What exports need of the stage. It follows the field: later steps change it."""
+        return GrownPart(self.scene.parts, self.scene.base_canonical, self.extractor, self.field)
 
     def step(self, step: int) -> StepRecord:
         """Run step `step` (counted from 0 over both phases) and change the field once.

@@ -28,8 +28,8 @@ from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_pieces import fill_pockets, keep_large
 from fd_mitsuba.export.solid.part_solid import LatticePart, lattice_part, part_solid, part_surface
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.training.geometry_stage import GeometryStage
 
 _FINER = (2, 4)
 """How many times finer than the training's the lattice is: as its edges are to be, within these."""
@@ -72,25 +72,23 @@ class FinalPart:
 _NOTHING = FinalPart(Solid(np.zeros((0, 3)), np.zeros((0, 3))), np.zeros((0, 3)), np.zeros(0))
 
 
-def final_parts(
-    stage: GeometryStage, faces: int, say: Callable[[str], None] = lambda line: None
-) -> dict[str, FinalPart]:
+def final_parts(grown: GrownPart, faces: int, say: Callable[[str], None] = lambda line: None) -> dict[str, FinalPart]:
     """The final surface of every named part; see `final_part`."""
-    return {name: final_part(stage, name, faces, say) for name in stage.scene.parts}
+    return {name: final_part(grown, name, faces, say) for name in grown.parts}
 
 
 def final_part(
-    stage: GeometryStage, name: str | None, faces: int, say: Callable[[str], None] = lambda line: None
+    grown: GrownPart, name: str | None, faces: int, say: Callable[[str], None] = lambda line: None
 ) -> FinalPart:
     """The final surface of one named part (None: of all together) with at most `faces` triangles, or few more.
 
     Where no solid comes out of it, the training's own surface is taken, and a line says so.
     """
-    coarse = lattice_part(stage, name)
+    coarse = lattice_part(grown, name)
     spacing = coarse.grid.spacing
     edge = max(_edge_for(_area(*part_surface(coarse)), faces), _SHORTEST_CELLS * spacing)
     factor = int(np.clip(round(spacing / edge), *_FINER))
-    function = part_function(stage, coarse, factor)
+    function = part_function(grown, coarse, factor)
     made = refined(coarse.grid, _lattice(coarse, _least(coarse)), function.values, factor)
     if made is None:
         return _NOTHING
@@ -113,33 +111,33 @@ def final_part(
     solid = Solid(vertices, triangles, islands, coarse.bridged)
     if not solid.manifold:
         say(f"part {name or 'part'}: its fine surface is no solid; the training's own is written instead")
-        plain = part_solid(stage, name)
+        plain = part_solid(grown, name)
         return FinalPart(plain, vertex_normals(plain.vertices, plain.faces), np.zeros(len(plain.vertices)))
     return FinalPart(solid, normals, distance)
 
 
-def part_function(stage: GeometryStage, coarse: LatticePart, factor: int) -> PartFunction:
+def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFunction:
     """The function of space whose zero set is the part's solid, bridges included.
 
     Args:
         factor: how many times finer than the training's a lattice for the part's own surface is.
     """
-    scene, geometry, grid = stage.scene, stage.config.geometry, coarse.grid
-    base = None if coarse.cuts else MeshDistance(scene.base_canonical.vertices, scene.base_canonical.faces)
+    extractor, grid = grown.extractor, coarse.grid
+    base = None if coarse.cuts else MeshDistance(grown.base.vertices, grown.base.faces)
 
-    width = fillet_width(geometry.union_k)
+    width = fillet_width(extractor.union_k)
 
     def sdf_part(points: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-        return stage.field.evaluate(points, region).sdf
+        return grown.field.evaluate(points, region).sdf
 
     function = PartFunction(
-        sdf_part, list(scene.parts.values()), coarse.number, grid, base, width, geometry.union_only_outside,
+        sdf_part, list(grown.parts.values()), coarse.number, grid, base, width, extractor.union_only_outside,
         fillet_reach(width, _FILM_CELLS * grid.spacing), coarse.sink,
         _lattice(coarse, coarse.sdf_base), coarse.bridges,
     )  # fmt: skip
     if base is None:
         return function
-    start, _ = stage.extractor.lattice_values(stage.field)
+    start, _ = extractor.lattice_values(grown.field)
     before = _surface_of(coarse, factor, start, lambda points: function.part_values(points, False))
     if not coarse.bridges:
         return replace(function, surface=(before, before))

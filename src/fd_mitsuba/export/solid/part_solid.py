@@ -28,12 +28,12 @@ from torch import Tensor
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_gaps, distance_to, fill_pockets, keep_large, part_volume
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.marching_tets import crossing_faces, crossing_fraction, edge_ends
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.union import soft_union
 from fd_mitsuba.scene.focal_region import union_sdf
-from fd_mitsuba.training.geometry_stage import GeometryStage
 
 SINK_CELLS = 1.75
 """How deep the solid reaches into the base, in cells: more than a tetrahedron's longest edge, sqrt(3), so that no
@@ -81,26 +81,26 @@ class LatticePart:
         return max((bridge.swelling for bridge in self.bridges), default=0.0)
 
 
-def lattice_part(stage: GeometryStage, name: str | None) -> LatticePart:
+def lattice_part(grown: GrownPart, name: str | None) -> LatticePart:
     """What the grid knows of one named part (None: of all together), without gradients.
 
     Raises:
         UserError: no part of that name.
     """
-    if name is not None and name not in stage.scene.parts:
-        raise UserError(f"no part {name!r} in this scene; it has {', '.join(stage.scene.parts)}")
-    geometry, grid = stage.config.geometry, stage.grid
-    sdf_part, positions = stage.extractor.lattice_values(stage.field)
-    sdf_base, sink = stage.extractor.sdf_base, SINK_CELLS * grid.spacing
+    if name is not None and name not in grown.parts:
+        raise UserError(f"no part {name!r} in this scene; it has {', '.join(grown.parts)}")
+    extractor, grid = grown.extractor, grown.grid
+    sdf_part, positions = extractor.lattice_values(grown.field)
+    sdf_base, sink = extractor.sdf_base, SINK_CELLS * grid.spacing
     # Moves inside the base (outside of it, if the part is cut out) are noise: no loss ever saw them.
     positions = torch.where((sdf_base > 0)[:, None], grid.vertices, positions)
-    reach = fillet_reach(geometry.union_k, grid.spacing)
-    cuts = isinstance(stage.extractor, SubtractionExtractor)
+    reach = fillet_reach(extractor.union_k, grid.spacing)
+    cuts = isinstance(extractor, SubtractionExtractor)
 
     def limits(part: Tensor) -> list[Tensor]:
         if cuts:
             return [part]
-        fillet = soft_union(sdf_base, part, geometry.union_k, geometry.union_only_outside)
+        fillet = soft_union(sdf_base, part, extractor.union_k, extractor.union_only_outside)
         fillet = fillet - torch.maximum(sdf_base, part)
         # Outside the part its sdf is what the losses left there, at times far above the true distance; that to the
         # vertices inside the part bounds it, coarsely: the surface may lie a tetrahedron's edge before them.
@@ -108,18 +108,18 @@ def lattice_part(stage: GeometryStage, name: str | None) -> LatticePart:
         lowered = sdf_base - (away - reach).clamp(min=0)
         return [torch.maximum(lowered, part) + fillet, sink - sdf_base]
 
-    owner, leads = _ownership(stage)
+    owner, leads = _ownership(grown)
     bridges: list[Bridge] = []
     if not cuts:  # a cavity in the base needs no way out
         sdf_part, bridges = bridge_gaps(grid, sdf_base, sdf_part, owner, lambda part: _inside(limits(part)))
-    number = None if name is None else list(stage.scene.parts).index(name)
-    lead = leads[number] if number is not None and len(stage.scene.parts) > 1 else None
+    number = None if name is None else list(grown.parts).index(name)
+    lead = leads[number] if number is not None and len(grown.parts) > 1 else None
     return LatticePart(
         grid, number, positions, limits(sdf_part), sdf_base, sdf_part, owner, lead, bridges, reach, sink, cuts
     )
 
 
-def part_solid(stage: GeometryStage, name: str | None) -> Solid:
+def part_solid(grown: GrownPart, name: str | None) -> Solid:
     """The closed solid of one named part (None: of all together) in the canonical frame, as the training's grid has it.
 
     It has no faces where the part is empty. Pieces too small to be meant are left out (see `keep_large`), closed
@@ -128,7 +128,7 @@ def part_solid(stage: GeometryStage, name: str | None) -> Solid:
     Raises:
         UserError: no part of that name.
     """
-    part = lattice_part(stage, name)
+    part = lattice_part(grown, name)
     inside, islands = _meant(part)
     vertices, faces = _surface(part.grid, part.positions, inside, _with_lead(part))
     return Solid(vertices.numpy(), faces.numpy(), islands, part.bridged)
@@ -167,12 +167,12 @@ def _inside(fields: list[Tensor]) -> Tensor:
     return reduce(torch.logical_and, [field > 0 for field in fields])
 
 
-def _ownership(stage: GeometryStage) -> tuple[Tensor, list[Tensor]]:
+def _ownership(grown: GrownPart) -> tuple[Tensor, list[Tensor]]:
     """The number of the part that each vertex of the grid belongs to, (count,), and each part's lead, (count,)."""
-    parts = list(stage.scene.parts.values())
+    parts = list(grown.parts.values())
     if len(parts) == 1:
-        return torch.zeros(stage.grid.count, dtype=torch.int64), [torch.ones(stage.grid.count)]
-    points = stage.grid.vertices.numpy()
+        return torch.zeros(grown.grid.count, dtype=torch.int64), [torch.ones(grown.grid.count)]
+    points = grown.grid.vertices.numpy()
     depths = torch.stack([torch.from_numpy(union_sdf(regions, points)).float() for regions in parts])
     leads = []
     for number in range(len(parts)):
