@@ -7,7 +7,7 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import get_args
 
 import numpy as np
@@ -26,7 +26,7 @@ from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, Guida
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
-from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation
+from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -62,6 +62,7 @@ class DiffusionGuidance(Denoiser):
         self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device)
         self._prompt: str | None = None
         self._negative_prompt = ""
+        self._part_prompts: dict[str, tuple[str, str]] = {}
 
     @classmethod
     def load(
@@ -100,12 +101,30 @@ class DiffusionGuidance(Denoiser):
             return []
         return unknown_words(self.components.tokenizer, f"{prompt} {negative_prompt}")
 
-    def prompts(self, views: GuidanceViews | AppearanceViews) -> list[str]:
-        """The text of each picture or mosaic; a mosaic goes by its first view."""
-        if self._prompt is None:
+    def set_part_prompts(self, prompts: Mapping[str, tuple[str, str]]) -> None:
+        """Take part -> (prompt, negative prompt) of the parts that have their own; "" is the scene's negative prompt.
+
+        Where a part's focal regions are seen (`GuidanceViews.regions`), the network's noise is what it sees with these
+        texts, elsewhere what it sees with those of `set_prompt`: one pass of the network more for each such part.
+        """
+        self._part_prompts = dict(prompts)
+
+    @property
+    def region_size(self) -> int | None:
+        """Side in pixels of `GuidanceViews.regions`; None where they are not looked at."""
+        return self.latent_size // self.view_grid if self._part_prompts else None
+
+    def prompts(self, views: GuidanceViews | AppearanceViews, text: str | None = None) -> list[str]:
+        """The text of each picture or mosaic; a mosaic goes by its first view.
+
+        Args:
+            text: a part's, in place of the scene's prompt.
+        """
+        text = self._prompt if text is None else text
+        if text is None:
             raise ValueError("set_prompt must be called before guide")
         return [
-            view_prompt(self._prompt, float(azimuth), views.closeup, self.conventions, self.config.view_prompts)
+            view_prompt(text, float(azimuth), views.closeup, self.conventions, self.config.view_prompts)
             for azimuth in list(views.azimuth_deg)[:: self.view_grid**2]
         ]
 
@@ -126,7 +145,7 @@ class DiffusionGuidance(Denoiser):
             raise ValueError(f"the {phase} phase takes pictures of {wanted} x {wanted}, not {size} x {size}")
         images, base = self._images(views.pictures, views.base, phase)
         drawn = self._draw(len(images), step, steps_total, phase, seed)
-        return self._distil(images, base, self.prompts(views), phase, *drawn)
+        return self._distil(images, base, views, phase, *drawn)
 
     @network_threads()
     def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
@@ -145,7 +164,7 @@ class DiffusionGuidance(Denoiser):
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
             mask = (adaptive_avg_pool2d(part, self.latent_size) >= MASK_THRESHOLD).to(images.dtype)
         drawn = self._draw(len(images), step, steps_total, "appearance", seed)
-        return self._distil(images, base, self.prompts(views), "appearance", *drawn, mask)
+        return self._distil(images, base, views, "appearance", *drawn, mask)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
         """Scaled latents z (N, 4, L, L) of pictures or mosaics. Gradients flow.
@@ -177,14 +196,15 @@ class DiffusionGuidance(Denoiser):
         self,
         images: Tensor,
         base: Tensor | None,
-        prompts: list[str],
+        views: GuidanceViews | AppearanceViews,
         phase: Phase,
         timesteps: Tensor,
         noise: Tensor,
         mask: Tensor | None = None,
     ) -> GuidanceResult:
         how, count = self._how(phase), len(images)
-        texts = self.embeddings(prompts, self.passes(how))
+        texts = self.embeddings(self.prompts(views), self.passes(how))
+        areas = self._areas(views, self.passes(how))
         rows_per_chunk = max(1, self.config.views_per_call // len(texts))
         track = images.requires_grad and torch.is_grad_enabled()
 
@@ -201,6 +221,7 @@ class DiffusionGuidance(Denoiser):
                 texts={name: embedding[rows] for name, embedding in texts.items()},
                 condition=None if base is None else self._condition(base[rows], phase),
                 mask=None if mask is None else mask[rows],
+                areas=tuple(area.rows(rows) for area in areas),
             )
             gradient, preview = self.latent_gradient(chunk, how)
             self._check_finite(gradient, chunk.timesteps, "latents")
@@ -238,10 +259,26 @@ class DiffusionGuidance(Denoiser):
             self.variant, settings.weighting, settings.guidance_scale, settings.image_guidance_scale, bounds
         )
 
-    def embeddings(self, prompts: list[str], passes: Iterable[str]) -> dict[str, Tensor]:
-        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt."""
-        negative = [self._negative_prompt] * len(prompts)
-        return {name: self._embed(prompts if name == "text" else negative) for name in passes}
+    def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
+        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt.
+
+        Args:
+            negative: in place of that of `set_prompt`.
+        """
+        against = [negative or self._negative_prompt] * len(prompts)
+        return {name: self._embed(prompts if name == "text" else against) for name in passes}
+
+    def _areas(self, views: GuidanceViews | AppearanceViews, passes: Iterable[str]) -> tuple[Area, ...]:
+        """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out."""
+        found = []
+        for part, (prompt, negative) in self._part_prompts.items():
+            if part not in views.regions:
+                raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
+            own = [name for name in passes if name == "text" or negative not in ("", self._negative_prompt)]
+            mask = tile_views(views.regions[part], self.view_grid).to(self.device)
+            texts = self.embeddings(self.prompts(views, prompt), own, negative)
+            found.append(Area(adaptive_avg_pool2d(mask, self.latent_size), texts))
+        return tuple(found)
 
     def _images(self, pictures: Tensor, base: Tensor | None, phase: Phase) -> tuple[Tensor, Tensor | None]:
         """Pictures and, if the model sees it, the base, as mosaics on the network's device."""

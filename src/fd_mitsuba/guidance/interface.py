@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -30,6 +30,8 @@ class GuidanceViews:
         azimuth_deg: B azimuths. A model that sees a mosaic takes consecutive views as one mosaic.
         elevation_deg: B elevations.
         closeup: whether the cameras are centred on the focal regions and close.
+        regions: part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first; given to
+            a guidance that has a `region_size`, which is R.
     """
 
     pictures: torch.Tensor
@@ -37,6 +39,7 @@ class GuidanceViews:
     azimuth_deg: Sequence[float]
     elevation_deg: Sequence[float]
     closeup: bool = False
+    regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
@@ -59,7 +62,7 @@ class AppearanceViews:
         part_mask: (B, 1, H, H) the part's coverage in [0, 1].
         shine: (B, 1, H, H) `colour_latents.shine` of the part times its coverage, for models that look at it. Gradients
             flow to it.
-        azimuth_deg, elevation_deg, closeup: as in `GuidanceViews`.
+        azimuth_deg, elevation_deg, closeup, regions: as in `GuidanceViews`.
     """
 
     pictures: torch.Tensor
@@ -70,6 +73,7 @@ class AppearanceViews:
     azimuth_deg: Sequence[float]
     elevation_deg: Sequence[float]
     closeup: bool = False
+    regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
@@ -100,7 +104,11 @@ class GuidanceResult:
 
 
 class Guidance(Protocol):
-    """A source of guidance. `DiffusionGuidance` is the one the package ships."""
+    """A source of guidance. `DiffusionGuidance` is the one the package ships.
+
+    Optional, for scenes whose focal regions have prompts: `set_part_prompts(prompts)` takes part -> (prompt, negative
+    prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
+    """
 
     needs_base: bool
     """Whether `GuidanceViews.base` must be given."""

@@ -63,10 +63,28 @@ class Distillation:
 
 
 @dataclass(frozen=True)
+class Area:
+    """A place in the pictures with texts of its own.
+
+    Attributes:
+        mask: (n, 1, L, L) in [0, 1]; of all areas together at most 1.
+        texts: pass -> (n, length, width), of the passes whose text differs from the chunk's.
+    """
+
+    mask: Tensor
+    texts: dict[str, Tensor]
+
+    def rows(self, rows: slice) -> Area:
+        """The area in some of the pictures."""
+        return Area(self.mask[rows], {name: text[rows] for name, text in self.texts.items()})
+
+
+@dataclass(frozen=True)
 class Chunk:
     """What the network needs for some pictures: all (n, ...), on its device, without gradients.
 
-    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere.
+    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere. `areas` have texts of
+    their own: there the network's noise is what it sees with these.
     """
 
     z: Tensor
@@ -75,6 +93,7 @@ class Chunk:
     texts: dict[str, Tensor]
     condition: Tensor | None
     mask: Tensor | None
+    areas: tuple[Area, ...] = ()
 
 
 class Network(Protocol):
@@ -117,11 +136,19 @@ class Query:
         return sds.add_noise(self.chunk.z, self.noise, self.alpha_bar(timesteps))
 
     def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
-        """Noise of each named pass."""
+        """Noise of each named pass: e + sum over areas of mask (e(area's text) - e)."""
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
         if missing := set(names) - set(texts):
             raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
-        return self.network.predict_noise(z_t, timesteps, texts, self.chunk.condition)
+        seen = self.network.predict_noise(z_t, timesteps, texts, self.chunk.condition)
+        merged = dict(seen)
+        for area in self.chunk.areas:
+            own = {name: area.texts[name] for name in texts if name in area.texts}
+            if not own:
+                continue
+            for name, noise in self.network.predict_noise(z_t, timesteps, own, self.chunk.condition).items():
+                merged[name] = merged[name] + area.mask * (noise - seen[name])
+        return merged
 
     def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
         """e_hat: classifier-free guidance."""

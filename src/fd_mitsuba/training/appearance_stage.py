@@ -31,6 +31,7 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
 from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
@@ -92,6 +93,7 @@ class AppearanceStage:
         self.exposure = settings.exposure or self._exposure()
         self._points = points_on(self.parts.values(), _POOL, seed_for(config.seed, Purpose.STYLE))
         self.losses = self._losses(say)
+        self._region_masks = RegionMasks(scene, config, guidance)
 
     def phase_name(self, step: int) -> str:
         """The name that the progress line shows."""
@@ -138,6 +140,7 @@ class AppearanceStage:
                 azimuth_deg=cameras.azimuth_deg,
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
+                regions=self._region_masks(cameras, step),
             )
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
             result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)

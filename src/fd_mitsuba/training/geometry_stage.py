@@ -29,6 +29,7 @@ from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
+from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
@@ -85,6 +86,7 @@ class GeometryStage:
         self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
         self._base_passes: dict[Phase, GeometryPass] = {}
+        self._region_masks = RegionMasks(scene, config, guidance)
         self.counters = {"invisible_steps": 0}
         """Whole numbers that steps hand on to later ones; a checkpoint keeps them."""
 
@@ -145,7 +147,8 @@ class GeometryStage:
         if self.guidance is not None and geometry.lambda_sds > 0:
             pictures = self._render(surface, cameras, phase, step)
             base = self._render_base(cameras, phase, step) if self.guidance.needs_base else None
-            views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup)
+            regions = self._region_masks(cameras, step)
+            views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup, regions)
             seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
             result = self.guidance.guide(views, phase_step, phase_length, phase, seed)
             losses["sds"], preview = result.loss, result.preview
