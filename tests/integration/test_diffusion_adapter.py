@@ -200,7 +200,7 @@ def test_instruct_pix2pix_step_equals_the_pipelines_own(folders: dict[str, Path]
         output_type="latent",
     ).images
     texts = {"text": guidance._embed(["a horse"])} | {n: guidance._embed(["blurry"]) for n in ("image", "plain")}
-    condition = guidance._condition(views.base, "refined")
+    condition = guidance.seen_base(views.base, "refined")
     with torch.no_grad():
         passes = guidance.predict_noise(z_t, t, texts, condition)
     noise = passes["plain"] + 1.5 * (passes["image"] - passes["plain"]) + 7.5 * (passes["text"] - passes["image"])
@@ -474,7 +474,13 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         "unet: cannot be loaded",
     ),
     "tensor missing": (lambda f: drop_tensor(f / UNET_FILE), "lack 1 tensors, conv_in.weight"),
-    "inpainting": (lambda f: edit_json(f / "unet/config.json", in_channels=9), "in_channels is 9"),
+    "depth": (lambda f: edit_json(f / "unet/config.json", in_channels=5), "in_channels is 5"),
+    "other channels": (lambda f: edit_json(f / "unet/config.json", in_channels=9), "unet: cannot be loaded"),
+    "consistency": (lambda f: edit_json(f / "unet/config.json", time_cond_proj_dim=256), "latent consistency model"),
+    "controlnet": (
+        lambda f: edit_json(f / "model_index.json", controlnet=["diffusers", "ControlNetModel"]),
+        "has a controlnet besides",
+    ),
     "latent channels": (lambda f: edit_json(f / "vae/config.json", latent_channels=16), "4 latent channels"),
     "text width": (lambda f: edit_json(f / "text_encoder/config.json", hidden_size=64), "cross_attention_dim 48"),
     "not square": (lambda f: edit_json(f / "unet/config.json", sample_size=[16, 24]), "not square"),

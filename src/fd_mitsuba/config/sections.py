@@ -16,6 +16,7 @@ from fd_mitsuba.config.bounds import (
     GuidanceScale,
     Length,
     Levels,
+    ModelName,
     Neurons,
     Points,
     Range,
@@ -254,14 +255,30 @@ class GuidanceConfig(Section):
 
     kind: Choice = Choice(kind="diffusion")
     """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
-    model: Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] = "builtin"
+    model: ModelName = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
+    lora: tuple[ModelName, ...] = ()
+    """LoRA files (.safetensors), or folders with one each, added to the model's weights."""
+    lora_scale: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)] = 1.0
+    """How much of each is added."""
+    words: tuple[ModelName, ...] = ()
+    """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
+    controlnet: ModelName = ""
+    """A ControlNet's folder or hub id, which is shown the surface in the appearance stage; none by default."""
+    controlnet_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
+    """How much the ControlNet steers."""
+    controlnet_sees: Literal["depth", "normal"] = "depth"
+    """What of the surface it is shown; what it was trained with."""
     variant: Choice = Choice(kind="sds")
     """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0
     """Weight of the base's image, for models with 8 input channels."""
+    perp_neg: Weight = 0.0
+    """Perp-Neg: weight of what the negative prompt asks for beside the prompt; 0: it stands for the empty text."""
+    mask_margin: Annotated[int, Field(ge=0, le=64)] = 2
+    """Inpainting models (9 input channels) repaint the focal regions and so many latent cells around them."""
     weighting: Weighting = "sds"
     """Weight of a timestep; `guidance.sds` has the formulas."""
     timestep_range_coarse: Range = (0.02, 0.35)

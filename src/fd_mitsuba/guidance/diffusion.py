@@ -18,10 +18,12 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.colour_latents import colour_latents
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
+from fd_mitsuba.guidance.inpainting import masked_base, repaint_mask
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
@@ -36,9 +38,11 @@ class DiffusionGuidance(Denoiser):
     """Score distillation with Stable Diffusion 1.x/2.x or an InstructPix2Pix model; see `interface.Guidance`.
 
     A UNet with 8 input channels sees the base's latents of the same view beside z_t and takes `image_guidance_scale` as
-    second scale. In the coarse phase (normal times coverage, 2 mask - 1) stands for scaled latents; in the refined
-    phase the normals, as colours on black, go through the VAE encoder (its mean: only t and the noise are random), and
-    so do the colours of the appearance stage, unless the model's conventions say `area_mean_shine`.
+    second scale; one with 9 sees the base without the focal regions, grown by `mask_margin`, which it is to fill.
+
+    In the coarse phase (normal times coverage, 2 mask - 1) stands for scaled latents; in the refined phase the normals,
+    as colours on black, go through the VAE encoder (its mean: only t and the noise are random), and so do the colours
+    of the appearance stage, unless the model's conventions say `area_mean_shine`.
     """
 
     def __init__(
@@ -52,6 +56,10 @@ class DiffusionGuidance(Denoiser):
         self.appearance = appearance or AppearanceConfig()
         self.variant = VARIANTS.make(config.variant, "guidance.variant")
         self.conventions = components.conventions
+        if config.perp_neg and "guided" not in self.variant.passes:
+            raise UserError(
+                f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
+            )
         self.view_grid = components.conventions.view_grid
         self.normal_space = components.conventions.normal_space
         vae = components.vae.config
@@ -59,7 +67,7 @@ class DiffusionGuidance(Denoiser):
         self.vae_scale_factor = 2 ** (len(vae.get("encoder_block_out_channels") or vae.block_out_channels) - 1)
         self.scaling_factor = float(vae.get("scaling_factor") or 1.0)
         self.shift_factor = float(vae.get("shift_factor") or 0.0)
-        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device)
+        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None
         self._negative_prompt = ""
         self._part_prompts: dict[str, tuple[str, str]] = {}
@@ -112,7 +120,12 @@ class DiffusionGuidance(Denoiser):
     @property
     def region_size(self) -> int | None:
         """Side in pixels of `GuidanceViews.regions`; None where they are not looked at."""
-        return self.latent_size // self.view_grid if self._part_prompts else None
+        return self.latent_size // self.view_grid if self._part_prompts or self.inpaints else None
+
+    @property
+    def control_sees(self) -> str | None:
+        """What a ControlNet is shown in the appearance stage: `depth` or `normal`; None: there is none."""
+        return self.config.controlnet_sees if self.components.controlnet is not None else None
 
     def prompts(self, views: GuidanceViews | AppearanceViews, text: str | None = None) -> list[str]:
         """The text of each picture or mosaic; a mosaic goes by its first view.
@@ -205,6 +218,8 @@ class DiffusionGuidance(Denoiser):
         how, count = self._how(phase), len(images)
         texts = self.embeddings(self.prompts(views), self.passes(how))
         areas = self._areas(views, self.passes(how))
+        holes = self._holes(views) if self.inpaints else None
+        control = self._control(views)
         rows_per_chunk = max(1, self.config.views_per_call // len(texts))
         track = images.requires_grad and torch.is_grad_enabled()
 
@@ -219,9 +234,10 @@ class DiffusionGuidance(Denoiser):
                 noise=noise[rows],
                 timesteps=timesteps[rows],
                 texts={name: embedding[rows] for name, embedding in texts.items()},
-                condition=None if base is None else self._condition(base[rows], phase),
+                condition=self._condition(base, holes, rows, phase),
                 mask=None if mask is None else mask[rows],
                 areas=tuple(area.rows(rows) for area in areas),
+                control=None if control is None else control[rows],
             )
             gradient, preview = self.latent_gradient(chunk, how)
             self._check_finite(gradient, chunk.timesteps, "latents")
@@ -256,7 +272,12 @@ class DiffusionGuidance(Denoiser):
             settings = self.config
             bounds = settings.timestep_range_refined if phase == "refined" else settings.timestep_range_coarse
         return Distillation(
-            self.variant, settings.weighting, settings.guidance_scale, settings.image_guidance_scale, bounds
+            self.variant,
+            settings.weighting,
+            settings.guidance_scale,
+            settings.image_guidance_scale,
+            bounds,
+            self.config.perp_neg,
         )
 
     def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
@@ -265,8 +286,10 @@ class DiffusionGuidance(Denoiser):
         Args:
             negative: in place of that of `set_prompt`.
         """
-        against = [negative or self._negative_prompt] * len(prompts)
-        return {name: self._embed(prompts if name == "text" else against) for name in passes}
+        against = negative or self._negative_prompt
+        read = {"text": prompts, "negative": [against] * len(prompts)}
+        without = ["" if self.config.perp_neg else against] * len(prompts)
+        return {name: self._embed(read.get(name, without)) for name in passes}
 
     def _areas(self, views: GuidanceViews | AppearanceViews, passes: Iterable[str]) -> tuple[Area, ...]:
         """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out."""
@@ -274,9 +297,12 @@ class DiffusionGuidance(Denoiser):
         for part, (prompt, negative) in self._part_prompts.items():
             if part not in views.regions:
                 raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
-            own = [name for name in passes if name == "text" or negative not in ("", self._negative_prompt)]
+            own = {"text"} if negative in ("", self._negative_prompt) else set(passes)
+            if self.config.perp_neg:
+                own &= {"text", "negative"}
             mask = tile_views(views.regions[part], self.view_grid).to(self.device)
-            texts = self.embeddings(self.prompts(views, prompt), own, negative)
+            names = [name for name in passes if name in own]
+            texts = self.embeddings(self.prompts(views, prompt), names, negative)
             found.append(Area(adaptive_avg_pool2d(mask, self.latent_size), texts))
         return tuple(found)
 
@@ -290,10 +316,47 @@ class DiffusionGuidance(Denoiser):
         images = tile_views(pictures, self.view_grid).to(self.device)
         return images, tile_views(base, self.view_grid).to(self.device).detach() if self.needs_base else None
 
+    def _condition(self, base: Tensor | None, holes: Tensor | None, rows: slice, phase: Phase) -> Tensor | None:
+        """What the network sees of the base beside z_t, for some of the pictures."""
+        if base is None:
+            return None
+        return self.seen_base(base[rows], phase) if holes is None else self.seen_around(base[rows], holes[rows], phase)
+
     @torch.no_grad()
-    def _condition(self, base: Tensor, phase: Phase) -> Tensor:
-        """The base's latents as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
+    def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
+        """The base's latents (N, 4, L, L) as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
         return self.encode(base, phase) / self.scaling_factor + self.shift_factor
+
+    @torch.no_grad()
+    def seen_around(self, base: Tensor, holes: Tensor, phase: Phase) -> Tensor:
+        """(N, 5, L, L) as inpainting models take it: the holes, and the scaled latents of the base without them.
+
+        Args:
+            holes: (N, 1, L, L), 1 where the model is to paint, 0 elsewhere.
+        """
+        return torch.cat([holes, self.encode(masked_base(base, holes, phase), phase)], dim=1)
+
+    def _control(self, views: GuidanceViews | AppearanceViews) -> Tensor | None:
+        """(N, 3, H, H) for the ControlNet at the size of the VAE's input; None in the geometry stage."""
+        if self.control_sees is None or not isinstance(views, AppearanceViews):
+            return None
+        if views.control is None:
+            raise ValueError(f"the ControlNet needs the surface's {self.control_sees} of the same views")
+        pictures = tile_views(views.control.detach(), self.view_grid).to(self.device).float()
+        side = self.latent_size * self.vae_scale_factor
+        if pictures.shape[-1] == side:
+            return pictures
+        return interpolate(pictures, size=(side, side), mode="bilinear", antialias=True)
+
+    def _holes(self, views: GuidanceViews | AppearanceViews) -> Tensor:
+        if not views.regions:
+            raise UserError(
+                f"{self.components.folder}: an inpainting model (9 input channels) is told by a mask what to paint, "
+                "and the views come without one; give GuidanceViews.regions"
+            )
+        part_mask = views.part_mask if isinstance(views, AppearanceViews) else None
+        margin = self.config.mask_margin
+        return repaint_mask(views.regions, part_mask, self.view_grid, self.latent_size, margin).to(self.device)
 
     def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""

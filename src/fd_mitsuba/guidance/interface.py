@@ -63,6 +63,7 @@ class AppearanceViews:
         shine: (B, 1, H, H) `colour_latents.shine` of the part times its coverage, for models that look at it. Gradients
             flow to it.
         azimuth_deg, elevation_deg, closeup, regions: as in `GuidanceViews`.
+        control: (B, 3, H, H) in [0, 1] what a ControlNet is shown of the surface, for a guidance with `control_sees`.
     """
 
     pictures: torch.Tensor
@@ -74,15 +75,16 @@ class AppearanceViews:
     elevation_deg: Sequence[float]
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    control: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
         if len(shape) != 4 or shape[1] != 3 or shape[2] != shape[3]:
             raise ValueError(f"pictures must be (B, 3, H, H), not {shape}")
-        if self.condition is not None and tuple(self.condition.shape) != shape:
-            raise ValueError(
-                f"the condition {tuple(self.condition.shape)} must have the shape of the pictures, {shape}"
-            )
+        for name in ("condition", "control"):
+            given = getattr(self, name)
+            if given is not None and tuple(given.shape) != shape:
+                raise ValueError(f"the {name} {tuple(given.shape)} must have the shape of the pictures, {shape}")
         for name in ("mask", "part_mask", "shine"):
             if tuple(getattr(self, name).shape) != (shape[0], 1, *shape[2:]):
                 raise ValueError(f"{name} must be {(shape[0], 1, *shape[2:])}, not {tuple(getattr(self, name).shape)}")
@@ -136,7 +138,10 @@ class Guidance(Protocol):
 
 
 class AppearanceGuidance(Protocol):
-    """A source of guidance for the appearance stage."""
+    """A source of guidance for the appearance stage.
+
+    Optional, beside what `Guidance` names: `control_sees`, `depth` or `normal`, asks for `AppearanceViews.control`.
+    """
 
     needs_base: bool
     """Whether `AppearanceViews.condition` must be given."""

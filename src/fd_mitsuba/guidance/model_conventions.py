@@ -25,7 +25,7 @@ class ModelConventions(BaseModel):
     normal_space: Literal["camera", "world"] | None = None
     """Frame of the normals in the training pictures; None: the weights do not care."""
     needs_base: bool | None = None
-    """If given, must agree with the UNet: 8 input channels take the base's picture as condition, 4 do not."""
+    """If given, must agree with the UNet: 8 and 9 input channels take the base's picture as condition, 4 do not."""
     condition: Literal["base", "clay"] | None = None
     """What the condition picture shows: the base alone, or the part on it in grey clay. For people, not checked."""
     latents: Literal["vae", "area_mean_shine"] = "vae"

@@ -24,6 +24,7 @@ from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.part_shading import PartShading
+from fd_mitsuba.render.surface_views import surface_views
 from fd_mitsuba.render.tonemap import CLAY_LEVEL, auto_exposure, to_linear, to_srgb
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
@@ -141,6 +142,7 @@ class AppearanceStage:
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
                 regions=self._region_masks(cameras, step),
+                control=self._control(gbuffer),
             )
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
             result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
@@ -193,6 +195,11 @@ class AppearanceStage:
         else:
             colour = torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
         return colour / self.exposure
+
+    def _control(self, gbuffer: GBuffer) -> Tensor | None:
+        """What the guidance's ControlNet, if it has one, is shown of the surface."""
+        kind = getattr(self.guidance, "control_sees", None)
+        return None if kind is None else surface_views(gbuffer, kind)
 
     @torch.no_grad()
     def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:
