@@ -244,7 +244,9 @@ def test_coarse_latents_are_normals_and_mask(folders: dict[str, Path]) -> None:
     pictures = views_for(guidance, "coarse", 1).pictures.detach()
     latents = guidance.encode(pictures, "coarse")
     assert latents[:, :3].equal(pictures[:, :3])
-    assert set(latents[:, 3].unique().tolist()) == {-1.0, 1.0}
+    assert set(latents[:, 3].unique().tolist()) == {0.0, 1.0}, "the paper: directly concatenated"
+    signed = load(folders["sd15"], mask_channel="signed").encode(pictures, "coarse")
+    assert signed[:, :3].equal(latents[:, :3]) and signed[:, 3:].equal(2 * latents[:, 3:] - 1)
 
 
 # Gradients in closed form, with the network replaced by one whose answer is known.
@@ -286,9 +288,7 @@ def test_gradient_of_a_known_denoiser(folders: dict[str, Path], variant: str, we
     if variant == "sds":
         w *= math.sqrt(abar / (1 - abar))
     pictures = views.pictures.detach()
-    difference = torch.cat([pictures[:, :3], 2 * pictures[:, 3:4] - 1], dim=1) - 0.25
-    expected = w * difference / 2
-    expected[:, 3] *= 2  # the latent of the mask is 2 mask - 1
+    expected = w * (pictures[:, :4] - 0.25) / 2
     got = gradient_of(guidance, views, "coarse")[:, :4]
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=2e-4 * w)
 
@@ -312,7 +312,6 @@ def test_gradient_from_the_passes_by_hand(folders: dict[str, Path], kind: str, v
     else:
         difference = e["plain"] + 7.5 * (e["text"] - e["plain"]) - noise
     expected = (1 - abar) * difference / 2
-    expected[:, 3] *= 2
     got = gradient_of(guidance, views, "coarse")[:, :4]
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5)
 
@@ -328,8 +327,7 @@ def test_normalised_gradient_does_not_depend_on_the_weighting(folders: dict[str,
         guidance = with_point_mass(folders["sd15"], weighting=weighting, normalise_gradient=True)
         gradients.append(gradient_of(guidance, views_for(guidance, "coarse", 2), "coarse"))
     torch.testing.assert_close(*gradients)
-    latent_part = gradients[0][:, :4] / torch.tensor([1, 1, 1, 2.0]).view(1, 4, 1, 1)
-    assert latent_part.abs().mean().item() == pytest.approx(1 / 2)
+    assert gradients[0][:, :4].abs().mean().item() == pytest.approx(1 / 2)
 
 
 @pytest.mark.parametrize(
@@ -626,13 +624,14 @@ def test_words_are_checked_where_the_tokenizer_knows_whole_words(folders: dict[s
 def test_shape_of_autoencoder_output_is_read_from_its_kind(folders: dict[str, Path]) -> None:
     guidance = load(folders["tiny_vae"])
     assert isinstance(guidance.components.vae, diffusers.AutoencoderTiny)
-    assert (guidance.scaling_factor, guidance.shift_factor, guidance.vae_scale_factor) == (1.0, 0.0, 8)
+    latents = guidance.latents
+    assert (latents.scaling_factor, latents.shift_factor, latents.vae_scale_factor) == (1.0, 0.0, 8)
     shifted = load(folders["sd15"])
     pictures = views_for(shifted, "refined", 1).pictures.detach()
     with torch.no_grad():
         plain = shifted.encode(pictures, "refined")
-        shifted.shift_factor = 0.5
-        torch.testing.assert_close(shifted.encode(pictures, "refined"), plain - 0.5 * shifted.scaling_factor)
+        shifted.latents.shift_factor = 0.5
+        torch.testing.assert_close(shifted.encode(pictures, "refined"), plain - 0.5 * shifted.latents.scaling_factor)
 
 
 def test_weights_take_no_gradients(folders: dict[str, Path]) -> None:

@@ -73,16 +73,13 @@ def noisy_latents(guidance: DiffusionGuidance, views: GuidanceViews) -> tuple[Te
     """z_t, timesteps, noise and alpha_bar of the coarse phase's first step, from the scheduler's own table."""
     timesteps, noise = guidance._draw(len(views.pictures), 0, 10, "coarse", 3)
     scheduler = diffusers.DDIMScheduler.from_pretrained(guidance.components.folder / "scheduler")
-    pictures = views.pictures.detach()
-    z = torch.cat([pictures[:, :3], 2 * pictures[:, 3:4] - 1], dim=1)
+    z = views.pictures.detach()[:, :4]
     alpha_bar = scheduler.alphas_cumprod[timesteps].view(-1, 1, 1, 1)
     return scheduler.add_noise(z, noise, timesteps), timesteps, noise, alpha_bar
 
 
 def assert_equal_gradients(got: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
-    """Relative to the largest; `expected` is with respect to the latents, whose fourth channel is 2 mask - 1."""
-    expected = expected.clone()
-    expected[:, 3] *= 2
+    """Relative to the largest; the latents of the coarse phase are the first four channels themselves."""
     assert (got[:, :4] - expected).abs().max() < tolerance * expected.abs().max()
 
 
@@ -174,7 +171,7 @@ def test_the_gradient_of_an_inpainting_model_by_hand(folders: dict[str, Path]) -
     pipeline = pipeline_of(folders["inpaint"])
     hole = torch.zeros(2, 1, SIDE, SIDE)
     hole[..., : SIDE // 2 + 1] = 1
-    around = torch.cat([views.base[:, :3], 2 * views.base[:, 3:4] - 1], dim=1) * (1 - hole)
+    around = views.base[:, :4] * (1 - hole)
     states = pipeline.encode_prompt(["a horse with wings"] * 2, "cpu", 1, True, ["blurry"] * 2)
     with torch.no_grad():
         e = [pipeline.unet(torch.cat([z_t, hole, around], dim=1), t, text).sample for text in states]
@@ -221,7 +218,7 @@ def test_perp_neg_by_hand(folders: dict[str, Path], kind: str) -> None:
     views = views_for(guidance)
     z_t, t, noise, alpha_bar = noisy_latents(guidance, views)
     pipeline = pipeline_of(folders["sd15"])
-    base = torch.cat([views.base[:, :3], 2 * views.base[:, 3:4] - 1], dim=1) / 0.18215
+    base = views.base[:, :4] / 0.18215
     unet = guidance.components.unet
 
     def seen(text: str, image: float = 1.0) -> Tensor:

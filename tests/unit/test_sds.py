@@ -17,7 +17,13 @@ def latents(*values: float) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("sds", [0.75, 0.36]), ("uniform", [1, 1]), ("fantasia3d", [0.375, 0.288]), ("inverse", [4 / 3, 1 / 0.36])],
+    [
+        ("sds", [0.75, 0.36]),
+        ("uniform", [1, 1]),
+        ("fantasia3d", [0.375, 0.288]),
+        ("inverse", [4 / 3, 1 / 0.36]),
+        ("ism", [3**0.5, 0.75]),
+    ],
 )
 def test_weightings(name: str, expected: list[float]) -> None:
     assert sds.weight(name, torch.tensor([0.25, 0.64])).tolist() == pytest.approx(expected)

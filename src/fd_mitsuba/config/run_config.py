@@ -38,6 +38,11 @@ _NEWER = {
     "guidance.controlnet": "",
     "guidance.controlnet_scale": 1.0,
     "guidance.controlnet_sees": "depth",
+    "guidance.mask_channel": "auto",
+    "guidance.normal_augmentation": "none",
+    "guidance.refined_background": "black",
+    "guidance.reduction": "mean",
+    "appearance.soft_mask": False,
 }
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 

@@ -29,7 +29,7 @@ from fd_mitsuba.config.bounds import (
 )
 from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
-from fd_mitsuba.conventions import TextureChannel, Weighting
+from fd_mitsuba.conventions import NormalAugmentation, TextureChannel, Weighting
 
 
 class Section(BaseModel):
@@ -212,6 +212,8 @@ class AppearanceConfig(Section):
     """As `guidance.image_guidance_scale`, for this stage."""
     mask_guidance: bool = True
     """Noise and gradient only where the part is seen."""
+    soft_mask: bool = False
+    """They fade with the share of a latent cell that the part covers, instead of ending where it is below a tenth."""
     lambda_sds: Weight = 1.0
     """Weight of the guidance's loss."""
     style: bool = False
@@ -287,6 +289,14 @@ class GuidanceConfig(Section):
     """The same in the refined phase."""
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
     """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
+    mask_channel: Literal["auto", "unit", "signed"] = "auto"
+    """The coarse phase's mask: `unit` 0 to 1, as in the paper; `signed` -1 to 1; `auto`: `signed` for packed priors."""
+    normal_augmentation: NormalAugmentation = "none"
+    """Random turns of the coarse phase's normals, a view each: the paper names an augmentation and not which."""
+    refined_background: Literal["black", "grey", "white"] = "black"
+    """Behind the normals of the refined phase, as colours."""
+    reduction: Literal["mean", "sum"] = "mean"
+    """Of the gradients of a step's pictures."""
     normalise_gradient: bool = False
     """Bring the guidance's gradient to a fixed size, so that the other weights are relative to it."""
     views_per_call: Annotated[Views, MAY_CHANGE] = 4

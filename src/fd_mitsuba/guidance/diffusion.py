@@ -13,20 +13,21 @@ from typing import get_args
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d
 
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.colour_latents import colour_latents
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
 from fd_mitsuba.guidance.inpainting import masked_base, repaint_mask
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
+from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
+from fd_mitsuba.guidance.picture_latents import PictureLatents
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
 from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation
 
@@ -40,9 +41,7 @@ class DiffusionGuidance(Denoiser):
     A UNet with 8 input channels sees the base's latents of the same view beside z_t and takes `image_guidance_scale` as
     second scale; one with 9 sees the base without the focal regions, grown by `mask_margin`, which it is to fill.
 
-    In the coarse phase (normal times coverage, 2 mask - 1) stands for scaled latents; in the refined phase the normals,
-    as colours on black, go through the VAE encoder (its mean: only t and the noise are random), and so do the colours
-    of the appearance stage, unless the model's conventions say `area_mean_shine`.
+    `PictureLatents` says how pictures become latents.
     """
 
     def __init__(
@@ -62,11 +61,7 @@ class DiffusionGuidance(Denoiser):
             )
         self.view_grid = components.conventions.view_grid
         self.normal_space = components.conventions.normal_space
-        vae = components.vae.config
-        self._sees_shine = components.conventions.latents == "area_mean_shine"
-        self.vae_scale_factor = 2 ** (len(vae.get("encoder_block_out_channels") or vae.block_out_channels) - 1)
-        self.scaling_factor = float(vae.get("scaling_factor") or 1.0)
-        self.shift_factor = float(vae.get("shift_factor") or 0.0)
+        self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
         self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None
         self._negative_prompt = ""
@@ -94,8 +89,8 @@ class DiffusionGuidance(Denoiser):
 
     def picture_size(self, phase: Phase) -> int:
         """Side in pixels of one view: the latents' own in the coarse phase, the VAE's input in the others."""
-        at_latent_size = phase == "coarse" or (phase == "appearance" and self._sees_shine)
-        return self.latent_size * (1 if at_latent_size else self.vae_scale_factor) // self.view_grid
+        at_latent_size = phase == "coarse" or (phase == "appearance" and self.latents.sees_shine)
+        return self.latent_size * (1 if at_latent_size else self.latents.vae_scale_factor) // self.view_grid
 
     @property
     def appearance_size(self) -> int:
@@ -156,7 +151,11 @@ class DiffusionGuidance(Denoiser):
         size, wanted = views.pictures.shape[-1], self.picture_size(phase)
         if size != wanted:
             raise ValueError(f"the {phase} phase takes pictures of {wanted} x {wanted}, not {size} x {size}")
-        images, base = self._images(views.pictures, views.base, phase)
+        pictures, shown = views.pictures, views.base
+        if phase == "coarse" and self.config.normal_augmentation != "none":
+            turns = random_turns(len(pictures), self.config.normal_augmentation, _generator(seed, step, phase, 1))
+            pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
+        images, base = self._images(pictures, shown, phase)
         drawn = self._draw(len(images), step, steps_total, phase, seed)
         return self._distil(images, base, views, phase, *drawn)
 
@@ -165,45 +164,25 @@ class DiffusionGuidance(Denoiser):
         """As `guide`, for colours, with the settings of the appearance stage (paper, "Appearance Editing").
 
         Pictures of any size are resized to what the model takes. With `appearance.mask_guidance` noise and gradient are
-        multiplied by the part's mask at the latents' size: 1 where the part covers at least `MASK_THRESHOLD` of a cell.
+        multiplied by the part's mask at the latents' size: 1 where the part covers at least `MASK_THRESHOLD` of a cell,
+        or with `appearance.soft_mask` the share that it covers.
         """
         pictures, condition = views.pictures, views.condition
-        if self._sees_shine:
+        if self.latents.sees_shine:
             pictures = torch.cat([pictures, views.shine], dim=1)
             condition = None if condition is None else torch.cat([condition, views.part_mask], dim=1)
         images, base = self._images(pictures, condition, "appearance")
         mask = None
         if self.appearance.mask_guidance:
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
-            mask = (adaptive_avg_pool2d(part, self.latent_size) >= MASK_THRESHOLD).to(images.dtype)
+            share = adaptive_avg_pool2d(part, self.latent_size)
+            mask = share if self.appearance.soft_mask else (share >= MASK_THRESHOLD).to(images.dtype)
         drawn = self._draw(len(images), step, steps_total, "appearance", seed)
         return self._distil(images, base, views, "appearance", *drawn, mask)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
-        """Scaled latents z (N, 4, L, L) of pictures or mosaics. Gradients flow.
-
-        Of geometry pictures (N, 5, H, H), coarse: (n coverage, 2 mask - 1) as it is; refined:
-        scaling_factor (E(2 (n + mask) / 2 - 1) - shift_factor). Of colours c (N, 3, H, H): the same with E(2 c - 1), or
-        `colour_latents` of colours and shine (N, 4, H, H).
-        """
-        if phase == "appearance":
-            if self._sees_shine:
-                return colour_latents(images.float(), self.latent_size)
-            side = self.latent_size * self.vae_scale_factor
-            pictures = images.float()
-            if pictures.shape[-1] != side:
-                pictures = interpolate(pictures, size=(side, side), mode="bilinear", antialias=True)
-            return self._through_vae(2 * pictures - 1)
-        normal, mask = images[:, :3], images[:, 3:4]
-        if phase == "coarse":
-            return torch.cat([normal, 2 * mask - 1], dim=1).float()
-        # (n + 1) / 2 on covered pixels over black is (n coverage + mask) / 2; the VAE takes twice that less 1.
-        return self._through_vae((normal + mask - 1).float())
-
-    def _through_vae(self, pictures: Tensor) -> Tensor:
-        encoded = self.components.vae.encode(pictures)
-        latents = encoded.latents if hasattr(encoded, "latents") else encoded.latent_dist.mean
-        return (latents - self.shift_factor) * self.scaling_factor
+        """Scaled latents z (N, 4, L, L) of pictures or mosaics; see `PictureLatents`. Gradients flow."""
+        return self.latents(images, phase)
 
     def _distil(
         self,
@@ -249,7 +228,7 @@ class DiffusionGuidance(Denoiser):
 
         gradient = torch.cat(latent_gradients)
         # The way back to the pictures is linear, so that it may be scaled at its end, when all chunks are known.
-        scale = 1 / count
+        scale = 1 / count if self.config.reduction == "mean" else 1.0
         if self.config.normalise_gradient:
             scale *= sds.normalising_scale(gradient, mask)
         value = 0.5 * scale * float(gradient.square().sum())
@@ -325,7 +304,7 @@ class DiffusionGuidance(Denoiser):
     @torch.no_grad()
     def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
         """The base's latents (N, 4, L, L) as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
-        return self.encode(base, phase) / self.scaling_factor + self.shift_factor
+        return self.latents.unscaled(self.encode(base, phase))
 
     @torch.no_grad()
     def seen_around(self, base: Tensor, holes: Tensor, phase: Phase) -> Tensor:
@@ -334,7 +313,9 @@ class DiffusionGuidance(Denoiser):
         Args:
             holes: (N, 1, L, L), 1 where the model is to paint, 0 elsewhere.
         """
-        return torch.cat([holes, self.encode(masked_base(base, holes, phase), phase)], dim=1)
+        return torch.cat(
+            [holes, self.encode(masked_base(base, holes, phase, self.latents.empty_mask(phase)), phase)], dim=1
+        )
 
     def _control(self, views: GuidanceViews | AppearanceViews) -> Tensor | None:
         """(N, 3, H, H) for the ControlNet at the size of the VAE's input; None in the geometry stage."""
@@ -342,11 +323,7 @@ class DiffusionGuidance(Denoiser):
             return None
         if views.control is None:
             raise ValueError(f"the ControlNet needs the surface's {self.control_sees} of the same views")
-        pictures = tile_views(views.control.detach(), self.view_grid).to(self.device).float()
-        side = self.latent_size * self.vae_scale_factor
-        if pictures.shape[-1] == side:
-            return pictures
-        return interpolate(pictures, size=(side, side), mode="bilinear", antialias=True)
+        return self.latents.resized(tile_views(views.control.detach(), self.view_grid).to(self.device).float())
 
     def _holes(self, views: GuidanceViews | AppearanceViews) -> Tensor:
         if not views.regions:
@@ -360,8 +337,7 @@ class DiffusionGuidance(Denoiser):
 
     def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
-        key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase)))
-        generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
+        generator = _generator(seed, step, phase)
         config, bounds = self.config, self._how(phase).timestep_range
         progress, levels = min(step / max(steps_total - 1, 1), 1.0), len(self.alpha_bars)
         if config.timestep_annealing == "none":
@@ -379,3 +355,9 @@ class DiffusionGuidance(Denoiser):
                 f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
                 "lower guidance.guidance_scale"
             )
+
+
+def _generator(seed: int, step: int, phase: Phase, *purpose: int) -> torch.Generator:
+    """Random numbers of a step; each purpose beside t and the noise has its own."""
+    key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase), *purpose))
+    return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))

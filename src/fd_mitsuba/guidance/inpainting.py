@@ -32,16 +32,16 @@ def repaint_mask(
     return max_pool2d((covered > 0).float(), 2 * margin + 1, stride=1, padding=margin)
 
 
-def masked_base(base: Tensor, holes: Tensor, phase: Phase) -> Tensor:
+def masked_base(base: Tensor, holes: Tensor, phase: Phase, empty_mask: float) -> Tensor:
     """The base's pictures, of which `encode` makes latents or colours that are 0 in the holes.
 
     Args:
         base: (N, 5, H, H) geometry pictures or (N, 3, H, H) colours in [0, 1].
         holes: (N, 1, L, L) of zeros and ones.
+        empty_mask: `PictureLatents.empty_mask` of the phase.
     """
     hole = interpolate(holes, size=base.shape[-2:], mode="nearest")
     if phase == "appearance":
         return base * (1 - hole) + 0.5 * hole
-    coverage = 0.5 if phase == "coarse" else 1.0  # of 2 mask - 1 and of normal + mask - 1
-    normal, mask = base[:, :3] * (1 - hole), base[:, 3:] * (1 - hole) + coverage * hole
+    normal, mask = base[:, :3] * (1 - hole), base[:, 3:] * (1 - hole) + empty_mask * hole
     return torch.cat([normal, mask], dim=1)

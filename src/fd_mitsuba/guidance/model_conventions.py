@@ -51,6 +51,11 @@ class ModelConventions(BaseModel):
     about: dict[str, Any] = {}
     """Free remarks (training data, licence); not read."""
 
+    @property
+    def is_packed(self) -> bool:
+        """Whether they were written for a prior of this package, which knows whole words."""
+        return self.whole_words or self.vocabulary is not None
+
     @model_validator(mode="after")
     def _template_fields_exist(self) -> ModelConventions:
         fields = {name for _, name, _, _ in string.Formatter().parse(self.prompt_template) if name is not None}

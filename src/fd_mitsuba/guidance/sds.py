@@ -27,7 +27,7 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
     """w(t), which the paper leaves open, for each alpha_bar.
 
     `sds`: 1 - alpha_bar (DreamFusion); `uniform`: 1; `fantasia3d`: sqrt(alpha_bar) (1 - alpha_bar);
-    `inverse`: 1 / (1 - alpha_bar).
+    `inverse`: 1 / (1 - alpha_bar); `ism`: sqrt((1 - alpha_bar) / alpha_bar) (LucidDreamer, arXiv 2311.11284).
     """
     if weighting == "sds":
         return 1 - alpha_bar
@@ -37,6 +37,8 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
         return alpha_bar.sqrt() * (1 - alpha_bar)
     if weighting == "inverse":
         return 1 / (1 - alpha_bar)
+    if weighting == "ism":
+        return ((1 - alpha_bar) / alpha_bar).sqrt()
     raise ValueError(f"unknown weighting {weighting!r}")
 
 
