@@ -614,6 +614,36 @@ def test_cgroup_limit_counts(tmp_path: Path) -> None:
     assert memory._cgroup_available(tmp_path) is None
 
 
+def test_the_tightest_of_nested_cgroups_counts(tmp_path: Path) -> None:
+    """A service within a slice: either may have a limit of its own, and the process is told its own path only."""
+    own = tmp_path / "cgroup"
+    own.write_text("0::/work.slice/run.scope\n")
+    for group, limit in (("work.slice", "5000"), ("work.slice/run.scope", "9000")):
+        (tmp_path / group).mkdir()
+        for name, text in {"memory.max": limit, "memory.current": "1000", "memory.stat": "inactive_file 0"}.items():
+            (tmp_path / group / name).write_text(text)
+    assert memory._cgroup_available(tmp_path, own) == 4000
+    (tmp_path / "work.slice" / "memory.max").write_text("max")
+    assert memory._cgroup_available(tmp_path, own) == 8000
+    own.write_text("0::/somewhere/else\n")
+    assert memory._cgroup_available(tmp_path, own) is None
+    assert memory._cgroup_available(tmp_path, tmp_path / "missing") is None
+
+
+@pytest.mark.parametrize("name", ["count_weights", "load"])
+def test_no_memory_is_not_taken_for_a_damaged_file(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError("Cannot allocate memory (os error 12)")
+
+    place = "safetensors.safe_open" if name == "count_weights" else "diffusers.UNet2DConditionModel.from_pretrained"
+    monkeypatch.setattr(place, fails)
+    with pytest.raises(UserError, match=r"out of memory .*os error 12.*guidance.views_per_call") as caught:
+        DiffusionGuidance.load(GuidanceConfig(model=str(folders["sd15"])))
+    assert "damaged" not in str(caught.value) and "fetch" not in str(caught.value)
+
+
 def test_words_are_checked_where_the_tokenizer_knows_whole_words(folders: dict[str, Path]) -> None:
     guidance = load(folders["sd15"])
     assert guidance.set_prompt("a dragon") == []

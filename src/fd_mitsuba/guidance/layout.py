@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from fd_mitsuba.errors import UserError, first_line
+from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
 
 LAYOUT = "only Stable Diffusion 1.x/2.x, inpainting and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
@@ -97,7 +97,9 @@ def count_weights(path: Path) -> int:
     try:
         with safe_open(path, framework="pt") as tensors:
             return sum(torch.Size(tensors.get_slice(key).get_shape()).numel() for key in tensors.keys())  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, MemoryError) as error:
+        if problem := out_of_memory(error):
+            raise UserError(f"{path}: {problem}") from None
         raise UserError(f"{path}: damaged weights ({first_line(error)}); copy or fetch the file again") from None
 
 

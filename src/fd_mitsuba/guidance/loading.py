@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.errors import UserError, first_line
+from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 from fd_mitsuba.guidance.control import check_controlnet, locate_controlnet
 from fd_mitsuba.guidance.layout import (
@@ -202,6 +202,8 @@ def _one_line(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
+        if problem := out_of_memory(error):
+            raise UserError(f"{path}: {problem}, or set guidance.dtype=bfloat16") from None
         raise UserError(f"{path}: cannot be loaded ({first_line(error)}); copy or fetch the model again") from None
 
 

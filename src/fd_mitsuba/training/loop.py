@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from fd_mitsuba.errors import Interrupted
+from fd_mitsuba.errors import Interrupted, RunStopped, out_of_memory
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, load_newest, save_checkpoint
 from fd_mitsuba.training.record import Recorder
 from fd_mitsuba.training.stage import OnStep, Stage, StepUpdate
@@ -50,7 +50,12 @@ def run_stage(
 
     with stop_on_signals() as request, Recorder(folder, stage.name, total, done, quiet) as recorder:
         for step in range(done, total):
-            record = stage.step(step)
+            try:
+                record = stage.step(step)
+            except (MemoryError, RuntimeError) as error:  # torch, Dr.Jit and CUDA say it in words only
+                if problem := out_of_memory(error):
+                    raise RunStopped(f"step {step + 1}: {problem}") from None
+                raise
             finished = step + 1
             last = finished == total
             stopped_by = request.name  # read once: a signal after this line stops the next step
