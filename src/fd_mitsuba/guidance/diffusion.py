@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
-from fd_mitsuba.guidance.device import require_device
+from fd_mitsuba.guidance.device import own_device, require_device
 from fd_mitsuba.guidance.inpainting import masked_base, repaint_mask
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
@@ -78,7 +79,7 @@ class DiffusionGuidance(Denoiser):
             appearance: the settings of `guide_appearance`. With them the model `builtin` is the prior of colours, which
                 serves that stage alone; a real model serves both.
         """
-        place = str(require_device(device or config.device))
+        place = str(require_device(device or own_device(config.device)))
         return cls(load_components(config, place, appearance is not None), config, place, appearance)
 
     def for_appearance(self, appearance: AppearanceConfig) -> DiffusionGuidance:
@@ -153,10 +154,12 @@ class DiffusionGuidance(Denoiser):
             raise ValueError(f"the {phase} phase takes pictures of {wanted} x {wanted}, not {size} x {size}")
         pictures, shown = views.pictures, views.base
         if phase == "coarse" and self.config.normal_augmentation != "none":
-            turns = random_turns(len(pictures), self.config.normal_augmentation, _generator(seed, step, phase, 1))
+            share, total = _share(views)
+            generator = _generator(seed, step, phase, 1)
+            turns = random_turns(total, self.config.normal_augmentation, generator)[share]
             pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
         images, base = self._images(pictures, shown, phase)
-        drawn = self._draw(len(images), step, steps_total, phase, seed)
+        drawn = self._draw_for(views, step, steps_total, phase, seed)
         return self._distil(images, base, views, phase, *drawn)
 
     @network_threads()
@@ -177,7 +180,7 @@ class DiffusionGuidance(Denoiser):
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
             share = adaptive_avg_pool2d(part, self.latent_size)
             mask = share if self.appearance.soft_mask else (share >= MASK_THRESHOLD).to(images.dtype)
-        drawn = self._draw(len(images), step, steps_total, "appearance", seed)
+        drawn = self._draw_for(views, step, steps_total, "appearance", seed)
         return self._distil(images, base, views, "appearance", *drawn, mask)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
@@ -194,7 +197,8 @@ class DiffusionGuidance(Denoiser):
         noise: Tensor,
         mask: Tensor | None = None,
     ) -> GuidanceResult:
-        how, count = self._how(phase), len(images)
+        how, count, (_, total) = self._how(phase), len(images), _share(views)
+        total //= self.view_grid**2
         texts = self.embeddings(self.prompts(views), self.passes(how))
         areas = self._areas(views, self.passes(how))
         holes = self._holes(views) if self.inpaints else None
@@ -228,9 +232,9 @@ class DiffusionGuidance(Denoiser):
 
         gradient = torch.cat(latent_gradients)
         # The way back to the pictures is linear, so that it may be scaled at its end, when all chunks are known.
-        scale = 1 / count if self.config.reduction == "mean" else 1.0
+        scale = 1 / total if self.config.reduction == "mean" else 1.0
         if self.config.normalise_gradient:
-            scale *= sds.normalising_scale(gradient, mask)
+            scale *= sds.normalising_scale(gradient, mask) if total == count else _scale_of_all(gradient, mask)
         value = 0.5 * scale * float(gradient.square().sum())
         loss = images.new_tensor(value)
         if track:
@@ -335,6 +339,16 @@ class DiffusionGuidance(Denoiser):
         margin = self.config.mask_margin
         return repaint_mask(views.regions, part_mask, self.view_grid, self.latent_size, margin).to(self.device)
 
+    def _draw_for(
+        self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """`_draw` for these of the step's views."""
+        share, total = _share(views)
+        grid = self.view_grid**2
+        timesteps, noise = self._draw(total // grid, step, steps_total, phase, seed)
+        own = slice(share.start // grid, share.stop // grid)
+        return timesteps[own], noise[own]
+
     def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
         generator = _generator(seed, step, phase)
@@ -361,3 +375,19 @@ def _generator(seed: int, step: int, phase: Phase, *purpose: int) -> torch.Gener
     """Random numbers of a step; each purpose beside t and the noise has its own."""
     key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase), *purpose))
     return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
+
+
+def _share(views: GuidanceViews | AppearanceViews) -> tuple[slice, int]:
+    """Which of the step's views these are, and how many there are in all processes."""
+    own = len(views.pictures)
+    if views.share is None:
+        return slice(0, own), own
+    return views.share, own * processes().count
+
+
+def _scale_of_all(gradient: Tensor, mask: Tensor | None) -> float:
+    """`sds.normalising_scale` over the views of all processes."""
+    size = gradient.abs()
+    covered = torch.ones_like(size) if mask is None else (mask.expand_as(size) > 0).to(size.dtype)
+    total, cells = (processes().sum(float(values.sum())) for values in (size * covered, covered))
+    return cells / max(total, torch.finfo(gradient.dtype).tiny) if cells else 1.0

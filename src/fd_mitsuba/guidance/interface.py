@@ -32,6 +32,7 @@ class GuidanceViews:
         closeup: whether the cameras are centred on the focal regions and close.
         regions: part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first; given to
             a guidance that has a `region_size`, which is R.
+        share: which of the step's views these are, where several processes share them; None: they are all.
     """
 
     pictures: torch.Tensor
@@ -40,6 +41,7 @@ class GuidanceViews:
     elevation_deg: Sequence[float]
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    share: slice | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
@@ -62,7 +64,7 @@ class AppearanceViews:
         part_mask: (B, 1, H, H) the part's coverage in [0, 1].
         shine: (B, 1, H, H) `colour_latents.shine` of the part times its coverage, for models that look at it. Gradients
             flow to it.
-        azimuth_deg, elevation_deg, closeup, regions: as in `GuidanceViews`.
+        azimuth_deg, elevation_deg, closeup, regions, share: as in `GuidanceViews`.
         control: (B, 3, H, H) in [0, 1] what a ControlNet is shown of the surface, for a guidance with `control_sees`.
     """
 
@@ -75,6 +77,7 @@ class AppearanceViews:
     elevation_deg: Sequence[float]
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    share: slice | None = None
     control: torch.Tensor | None = None
 
     def __post_init__(self) -> None:

@@ -138,6 +138,17 @@ def prepare_appearance(
     return guidance
 
 
+def cuts_stay_plain(scene: EditScene, config: RunConfig, given: object = None) -> bool:
+    """Whether the appearance stage is left out, because the built-in prior would guide it and knows no cuts.
+
+    Args:
+        given: a caller's own guidance.
+    """
+    diffusion = config.guidance.kind.kind == "diffusion"
+    by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(given, "guide_appearance")
+    return scene.subtracts and config.appearance.lambda_sds > 0 and by_builtin
+
+
 def _own_guidance(config: RunConfig, shared: Guidance | None, given: Guidance | None) -> AppearanceGuidance | None:
     """A caller's guidance or another module's, where it can guide the appearance."""
     found: Any = given

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
@@ -124,7 +125,9 @@ class AppearanceStage:
         """
         settings = self.config.appearance
         cameras, closeup = self.cameras(step)
-        seed = seed_for(self.config.seed, Purpose.APPEARANCE_PIXELS, step)
+        share = processes().share(len(cameras))
+        cameras = cameras.some(share)
+        seed = seed_for(self.config.seed, Purpose.APPEARANCE_PIXELS, step) + share.start
         gbuffer = self.rendering.trace(cameras, seed)
         texture = self.texture(gbuffer)
         losses: dict[str, Tensor] = {}
@@ -141,13 +144,15 @@ class AppearanceStage:
                 azimuth_deg=cameras.azimuth_deg,
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
-                regions=self._region_masks(cameras, step),
+                regions=self._region_masks(cameras, step, share.start),
+                share=share,
                 control=self._control(gbuffer),
             )
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
             result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
             losses["sds"], preview = result.loss, result.preview
             values.update(result.logs)
+        values = processes().values_of_all(values)
         losses.update(self.losses(texture, gbuffer, self.field, step))
         weights = {"sds": settings.lambda_sds, **self.losses.weights}
         values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
@@ -191,7 +196,9 @@ class AppearanceStage:
             return self.rendering.render_light(gbuffer)
         if kind == "random":
             generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.BACKGROUND, step))
-            colour = to_linear(torch.rand(gbuffer.views.count, 3, 1, 1, generator=generator))
+            count = self.config.appearance.views
+            colours = torch.rand(count, 3, 1, 1, generator=generator)[processes().share(count)]
+            colour = to_linear(colours)
         else:
             colour = torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
         return colour / self.exposure

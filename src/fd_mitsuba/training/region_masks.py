@@ -23,11 +23,15 @@ class RegionMasks:
         self._scene, self._config, self._guidance = scene, config, guidance
         self._views: RegionViews | None = None
 
-    def __call__(self, cameras: CameraBatch, step: int) -> dict[str, Tensor]:
-        """Part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first."""
+    def __call__(self, cameras: CameraBatch, step: int, first: int) -> dict[str, Tensor]:
+        """Part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first.
+
+        Args:
+            first: which of the step's views the first one is.
+        """
         size = getattr(self._guidance, "region_size", None)
         if size is None:
             return {}
         if self._views is None:
             self._views = RegionViews(self._scene.parts, size, self._config.geometry.focal_band)
-        return self._views.render(cameras, seed_for(self._config.seed, Purpose.REGIONS, step))
+        return self._views.render(cameras, seed_for(self._config.seed, Purpose.REGIONS, step) + first)
