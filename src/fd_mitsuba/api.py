@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
 from fd_mitsuba.config import ChosenSettings, RunConfig, misfits, settings_for_run
 from fd_mitsuba.config.registry import load_plugins
@@ -140,6 +141,14 @@ def edit(
     taken = None if geometry_from is None else Path(geometry_from)
     if tries is not None and (taken, guidance, on_step) != (None, None, None):
         raise UserError("tries: grows shapes of its own; leave out the other run, and guidance and on_step")
+    if processes().count > 1 and tries is not None:
+        raise UserError("tries: grows its shapes in one process; leave torchrun or --tries out")
+    if not processes().writes:
+        from fd_mitsuba.runs.follower import follow
+
+        follow(scene, config, folder, resume, tuple(stages), taken)
+        processes().wait()
+        return Run(folder)
     with reported(folder, log):
         if tries is not None:
             run_tries(scene, config, folder, tries, resume, command, quiet, log, tuple(stages), opening)
@@ -148,6 +157,7 @@ def edit(
                 scene, config, folder, resume, command, quiet, log, tuple(stages), taken, guidance, on_step, opening,
                 judge=judge_run,
             )  # fmt: skip
+    processes().wait()
     result = Run(folder)
     said = result.metrics.get("verdict", {}).get("line")
     for warning in result.warnings:

@@ -33,8 +33,11 @@ TextureChannel = Literal["base_color", "roughness", "metallic", "normal"]
 TEXTURE_CHANNELS: tuple[TextureChannel, ...] = get_args(TextureChannel)
 """What a texture field says at a point: kd, the two of krm, kn."""
 
-Weighting = Literal["sds", "uniform", "fantasia3d", "inverse"]
+Weighting = Literal["sds", "uniform", "fantasia3d", "inverse", "ism"]
 """Names of w(t); `guidance.sds.weight` has the formulas."""
+
+NormalAugmentation = Literal["none", "rotation", "rotation_flip"]
+"""Random turns of the coarse phase's normals; `guidance.normal_augmentation` has them."""
 
 BASE_NAME = "base"
 DEFAULT_PART_NAME = "part"

@@ -48,5 +48,5 @@ def out_of_memory(error: BaseException) -> UserError | None:
     about = f" ({text[:160]})" if text else ""
     return UserError(
         f"out of memory{about}; free some, or lower what is large: sizes of pictures and textures, samples, views, "
-        "geometry.grid_resolution, field.log2_table, the base's faces"
+        "guidance.views_per_call, geometry.grid_resolution, field.log2_table, the base's faces"
     )

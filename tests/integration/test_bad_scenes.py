@@ -55,6 +55,25 @@ CASES: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
         {"region": region('<scale value="0.04"/><translate x="0.55" y="0.5" z="-0.4"/>')},
         ("wing", "away from the base", "move it closer"),
     ),
+    "region prompt blank": (
+        {"region": region(NEAR, '<string name="prompt" value=" "/>')},
+        ("wing", "prompt is blank", "remove it"),
+    ),
+    "region prompt not text": (
+        {"region": region(NEAR, '<float name="prompt" value="2"/>')},
+        ("wing", "prompt", "not text"),
+    ),
+    "region negative prompt alone": (
+        {"region": region(NEAR, '<string name="negative_prompt" value="blurry"/>')},
+        ("wing", "without a prompt", "add"),
+    ),
+    "two prompts of one part": (
+        {
+            "region": region(NEAR, '<string name="prompt" value="a hat"/>')
+            + region(NEAR, '<string name="prompt" value="wings"/>').replace("wing", "other", 1)
+        },
+        ("other", "wing", "'a hat'", "'wings'", "another part"),
+    ),
     "region singular": ({"region": region('<scale x="0" y="1" z="1"/>')}, ("wing", "singular", "scales other than 0")),
     "region NaN": ({"region": region('<translate x="nan"/>')}, ("wing", "NaN", "correct")),
     "region infinite": ({"region": region('<scale value="inf"/>')}, ("wing", "infinity", "correct")),

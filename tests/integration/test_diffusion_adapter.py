@@ -200,7 +200,7 @@ def test_instruct_pix2pix_step_equals_the_pipelines_own(folders: dict[str, Path]
         output_type="latent",
     ).images
     texts = {"text": guidance._embed(["a horse"])} | {n: guidance._embed(["blurry"]) for n in ("image", "plain")}
-    condition = guidance._condition(views.base, "refined")
+    condition = guidance.seen_base(views.base, "refined")
     with torch.no_grad():
         passes = guidance.predict_noise(z_t, t, texts, condition)
     noise = passes["plain"] + 1.5 * (passes["image"] - passes["plain"]) + 7.5 * (passes["text"] - passes["image"])
@@ -244,7 +244,9 @@ def test_coarse_latents_are_normals_and_mask(folders: dict[str, Path]) -> None:
     pictures = views_for(guidance, "coarse", 1).pictures.detach()
     latents = guidance.encode(pictures, "coarse")
     assert latents[:, :3].equal(pictures[:, :3])
-    assert set(latents[:, 3].unique().tolist()) == {-1.0, 1.0}
+    assert set(latents[:, 3].unique().tolist()) == {0.0, 1.0}, "the paper: directly concatenated"
+    signed = load(folders["sd15"], mask_channel="signed").encode(pictures, "coarse")
+    assert signed[:, :3].equal(latents[:, :3]) and signed[:, 3:].equal(2 * latents[:, 3:] - 1)
 
 
 # Gradients in closed form, with the network replaced by one whose answer is known.
@@ -286,9 +288,7 @@ def test_gradient_of_a_known_denoiser(folders: dict[str, Path], variant: str, we
     if variant == "sds":
         w *= math.sqrt(abar / (1 - abar))
     pictures = views.pictures.detach()
-    difference = torch.cat([pictures[:, :3], 2 * pictures[:, 3:4] - 1], dim=1) - 0.25
-    expected = w * difference / 2
-    expected[:, 3] *= 2  # the latent of the mask is 2 mask - 1
+    expected = w * (pictures[:, :4] - 0.25) / 2
     got = gradient_of(guidance, views, "coarse")[:, :4]
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=2e-4 * w)
 
@@ -312,7 +312,6 @@ def test_gradient_from_the_passes_by_hand(folders: dict[str, Path], kind: str, v
     else:
         difference = e["plain"] + 7.5 * (e["text"] - e["plain"]) - noise
     expected = (1 - abar) * difference / 2
-    expected[:, 3] *= 2
     got = gradient_of(guidance, views, "coarse")[:, :4]
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5)
 
@@ -328,8 +327,7 @@ def test_normalised_gradient_does_not_depend_on_the_weighting(folders: dict[str,
         guidance = with_point_mass(folders["sd15"], weighting=weighting, normalise_gradient=True)
         gradients.append(gradient_of(guidance, views_for(guidance, "coarse", 2), "coarse"))
     torch.testing.assert_close(*gradients)
-    latent_part = gradients[0][:, :4] / torch.tensor([1, 1, 1, 2.0]).view(1, 4, 1, 1)
-    assert latent_part.abs().mean().item() == pytest.approx(1 / 2)
+    assert gradients[0][:, :4].abs().mean().item() == pytest.approx(1 / 2)
 
 
 @pytest.mark.parametrize(
@@ -474,7 +472,13 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         "unet: cannot be loaded",
     ),
     "tensor missing": (lambda f: drop_tensor(f / UNET_FILE), "lack 1 tensors, conv_in.weight"),
-    "inpainting": (lambda f: edit_json(f / "unet/config.json", in_channels=9), "in_channels is 9"),
+    "depth": (lambda f: edit_json(f / "unet/config.json", in_channels=5), "in_channels is 5"),
+    "other channels": (lambda f: edit_json(f / "unet/config.json", in_channels=9), "unet: cannot be loaded"),
+    "consistency": (lambda f: edit_json(f / "unet/config.json", time_cond_proj_dim=256), "latent consistency model"),
+    "controlnet": (
+        lambda f: edit_json(f / "model_index.json", controlnet=["diffusers", "ControlNetModel"]),
+        "has a controlnet besides",
+    ),
     "latent channels": (lambda f: edit_json(f / "vae/config.json", latent_channels=16), "4 latent channels"),
     "text width": (lambda f: edit_json(f / "text_encoder/config.json", hidden_size=64), "cross_attention_dim 48"),
     "not square": (lambda f: edit_json(f / "unet/config.json", sample_size=[16, 24]), "not square"),
@@ -610,6 +614,36 @@ def test_cgroup_limit_counts(tmp_path: Path) -> None:
     assert memory._cgroup_available(tmp_path) is None
 
 
+def test_the_tightest_of_nested_cgroups_counts(tmp_path: Path) -> None:
+    """A service within a slice: either may have a limit of its own, and the process is told its own path only."""
+    own = tmp_path / "cgroup"
+    own.write_text("0::/work.slice/run.scope\n")
+    for group, limit in (("work.slice", "5000"), ("work.slice/run.scope", "9000")):
+        (tmp_path / group).mkdir()
+        for name, text in {"memory.max": limit, "memory.current": "1000", "memory.stat": "inactive_file 0"}.items():
+            (tmp_path / group / name).write_text(text)
+    assert memory._cgroup_available(tmp_path, own) == 4000
+    (tmp_path / "work.slice" / "memory.max").write_text("max")
+    assert memory._cgroup_available(tmp_path, own) == 8000
+    own.write_text("0::/somewhere/else\n")
+    assert memory._cgroup_available(tmp_path, own) is None
+    assert memory._cgroup_available(tmp_path, tmp_path / "missing") is None
+
+
+@pytest.mark.parametrize("name", ["count_weights", "load"])
+def test_no_memory_is_not_taken_for_a_damaged_file(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError("Cannot allocate memory (os error 12)")
+
+    place = "safetensors.safe_open" if name == "count_weights" else "diffusers.UNet2DConditionModel.from_pretrained"
+    monkeypatch.setattr(place, fails)
+    with pytest.raises(UserError, match=r"out of memory .*os error 12.*guidance.views_per_call") as caught:
+        DiffusionGuidance.load(GuidanceConfig(model=str(folders["sd15"])))
+    assert "damaged" not in str(caught.value) and "fetch" not in str(caught.value)
+
+
 def test_words_are_checked_where_the_tokenizer_knows_whole_words(folders: dict[str, Path]) -> None:
     guidance = load(folders["sd15"])
     assert guidance.set_prompt("a dragon") == []
@@ -620,13 +654,14 @@ def test_words_are_checked_where_the_tokenizer_knows_whole_words(folders: dict[s
 def test_shape_of_autoencoder_output_is_read_from_its_kind(folders: dict[str, Path]) -> None:
     guidance = load(folders["tiny_vae"])
     assert isinstance(guidance.components.vae, diffusers.AutoencoderTiny)
-    assert (guidance.scaling_factor, guidance.shift_factor, guidance.vae_scale_factor) == (1.0, 0.0, 8)
+    latents = guidance.latents
+    assert (latents.scaling_factor, latents.shift_factor, latents.vae_scale_factor) == (1.0, 0.0, 8)
     shifted = load(folders["sd15"])
     pictures = views_for(shifted, "refined", 1).pictures.detach()
     with torch.no_grad():
         plain = shifted.encode(pictures, "refined")
-        shifted.shift_factor = 0.5
-        torch.testing.assert_close(shifted.encode(pictures, "refined"), plain - 0.5 * shifted.scaling_factor)
+        shifted.latents.shift_factor = 0.5
+        torch.testing.assert_close(shifted.encode(pictures, "refined"), plain - 0.5 * shifted.latents.scaling_factor)
 
 
 def test_weights_take_no_gradients(folders: dict[str, Path]) -> None:

@@ -74,7 +74,7 @@ def tiny_vae() -> diffusers.AutoencoderKL:
 
 
 def build_pipeline(kind: str, seed: int = 0) -> diffusers.DiffusionPipeline:
-    """`sd15` (eps), `sd21` (v, OpenCLIP-like text encoder), `ip2p` (8 channels) or `tiny_vae` (AutoencoderTiny)."""
+    """`sd15` (eps), `sd21` (v, OpenCLIP-like text encoder), `ip2p` (8 channels), `inpaint` (9), `tiny_vae`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         common = dict(safety_checker=None, feature_extractor=None, requires_safety_checker=False)
@@ -99,11 +99,13 @@ def build_pipeline(kind: str, seed: int = 0) -> diffusers.DiffusionPipeline:
             ),
             text_encoder=tiny_text_encoder(tokenizer),
             tokenizer=tokenizer,
-            unet=diffusers.UNet2DConditionModel(**UNET_1_5, in_channels=8 if kind == "ip2p" else 4),
+            unet=diffusers.UNet2DConditionModel(**UNET_1_5, in_channels={"ip2p": 8, "inpaint": 9}.get(kind, 4)),
             scheduler=diffusers.PNDMScheduler(**BETAS, skip_prk_steps=True, steps_offset=1),
         )
         if kind == "ip2p":
             return diffusers.StableDiffusionInstructPix2PixPipeline(**parts, **common)
+        if kind == "inpaint":
+            return diffusers.StableDiffusionInpaintPipeline(**parts, **common)
         return diffusers.StableDiffusionPipeline(**parts, **common)
 
 

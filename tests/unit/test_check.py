@@ -13,6 +13,7 @@ from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import GeometryConfig, GuidanceConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import working_set_bytes
+from fd_mitsuba.guidance.speed import measured_speed
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.cost import LIT_PICTURES_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
 from fd_mitsuba.runs.geometry_outcome import prepare_geometry
@@ -178,7 +179,10 @@ def test_cost_follows_what_it_depends_on(make_scene: Make) -> None:
         (["geometry.coarse_fraction=0.0"], 0.7, 1170),
     ],
 )
-def test_cost_of_runs_that_were_measured(more: list[str], seconds: float, megabytes: float) -> None:
+def test_cost_of_runs_that_were_measured(
+    monkeypatch: pytest.MonkeyPatch, more: list[str], seconds: float, megabytes: float
+) -> None:
+    monkeypatch.setattr("fd_mitsuba.runs.cost.cores_in_use", lambda: 2)  # as they were measured
     scene = load_edit_scene(ROOT / "scenes" / "pegasus" / "scene.xml")
     cost = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", more))
     assert cost.seconds_per_step == pytest.approx(seconds, rel=0.3)
@@ -202,6 +206,59 @@ def test_cost_of_the_appearance_stage(make_scene: Make) -> None:
     cut = ball("0.15", 0, 0.3, 0).replace("<transform", '<string name="mode" value="subtract"/><transform')
     left_out = estimate_cost(load_edit_scene(make_scene(region=cut)), RunConfig())
     assert left_out.appearance_seconds_total == 0
+
+
+@pytest.mark.parametrize(
+    ("device", "dtype", "found", "said"),
+    [
+        ("cpu", "float32", {"float32": 2e10}, "networks on cpu at 0.02 TFLOP/s in float32, as measured just now"),
+        (
+            "cuda",
+            "float16",
+            {"float32": 2e13, "float16": 1e14},
+            "networks on cuda at 100 TFLOP/s in float16 and 20 TFLOP/s in float32, as measured just now",
+        ),
+        (
+            "cuda",
+            "float16",
+            {},
+            "60 TFLOP/s in float16 and 30 TFLOP/s in float32, as of a usual card: torch finds no cuda",
+        ),
+    ],
+)
+def test_cost_of_a_real_model_follows_the_speed_of_its_device(
+    make_scene: Make, monkeypatch: pytest.MonkeyPatch, device: str, dtype: str, found: dict[str, float], said: str
+) -> None:
+    """0.7e12 operations a view and pass, 2.2e12 for a picture to the latents and back, four views and two passes."""
+    monkeypatch.setattr("fd_mitsuba.guidance.speed.measured_speed", lambda _, kind: found.get(kind))
+    chosen = [f"guidance.device={device}", f"guidance.dtype={dtype}", "guidance.model=somebody/model"]
+    scene = load_edit_scene(make_scene())
+    with_it, without = (
+        estimate_cost(scene, RunConfig.load(None, [*chosen, "geometry.coarse_fraction=0", *more]))
+        for more in ([], ["geometry.lambda_sds=0"])
+    )
+    unet, vae = (found or {"float16": 6e13, "float32": 3e13}).get(dtype), (found or {"float32": 3e13})["float32"]
+    networks = 4 * (2 * 800 * 860e6 / unet + 2.2e12 / vae)
+    rendering = with_it.seconds_per_step - without.seconds_per_step - networks
+    assert 0 <= rendering < 4
+    assert any(said in assumption for assumption in with_it.assumptions)
+
+
+def test_the_built_in_prior_is_not_measured(make_scene: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that `check` of a shipped scene takes no longer."""
+    monkeypatch.setattr("fd_mitsuba.guidance.speed.measured_speed", lambda *_: pytest.fail("measured all the same"))
+    scene = load_edit_scene(make_scene())
+    estimate_cost(scene, RunConfig())
+    estimate_cost(
+        scene, RunConfig.load(None, ["guidance.model=a/b", "geometry.lambda_sds=0", "appearance.lambda_sds=0"])
+    )
+
+
+def test_the_speed_of_a_device() -> None:
+    assert 1e8 < measured_speed("cpu", "float32", 0.0) < 1e15
+    assert measured_speed("cuda:99", "float16", 0.0) is None
+    with pytest.raises(ValueError, match="float64"):
+        measured_speed("cpu", "float64")
 
 
 def test_memory_of_stable_diffusion_is_what_loading_it_demands(make_scene: Make) -> None:

@@ -15,7 +15,7 @@ from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
 from fd_mitsuba.guidance.prompts import TextEmbeddings
-from fd_mitsuba.guidance.variants import Chunk, passes_of
+from fd_mitsuba.guidance.variants import Area, Chunk, passes_of
 
 BUILT_IN = ("sds", "csd", "ism", "reconstruction")
 
@@ -92,6 +92,23 @@ def test_ism_near_the_clean_end_needs_no_inversion() -> None:
     network, what = denoiser(), chunk(20)
     assert gradient("ism", what, network).isfinite().all()
     assert len(network.components.unet.seen) == 2, "one look at z_s = z_0, one at z_t"
+
+
+@pytest.mark.parametrize("channels", [4, 8])
+@pytest.mark.parametrize("variant", BUILT_IN)
+def test_an_area_has_the_gradient_of_its_own_texts(variant: str, channels: int) -> None:
+    """This network sees each latent cell alone: the left half is as if its texts were those of the whole picture."""
+    what = chunk(100, 700, base=0.4 if channels == 8 else None)
+    own = {"text": torch.full_like(what.texts["text"], -1.5), "image": torch.full_like(what.texts["image"], 0.1)}
+    left = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
+    left[..., :2] = 1
+    settings = {"guidance_scale": 3.0, "image_guidance_scale": 1.5}
+    got = gradient(variant, replace(what, areas=(Area(left, own),)), denoiser("epsilon", channels), **settings)
+    scene = gradient(variant, what, denoiser("epsilon", channels), **settings)
+    part = gradient(variant, replace(what, texts=what.texts | own), denoiser("epsilon", channels), **settings)
+    torch.testing.assert_close(got[..., :2], part[..., :2])
+    torch.testing.assert_close(got[..., 2:], scene[..., 2:])
+    assert (part - scene).abs().min() > 1e-3
 
 
 @pytest.mark.parametrize("variant", BUILT_IN)

@@ -241,6 +241,9 @@ class Listening:
         self.told += [prompt, negative_prompt]
         return []
 
+    def set_part_prompts(self, prompts: dict[str, tuple[str, str]]) -> None:
+        self.parts = prompts
+
 
 def test_other_models_get_prompts_as_they_are(vocabulary: Vocabulary) -> None:
     other, own, heard = Listening(None), Listening(vocabulary), []
@@ -250,4 +253,16 @@ def test_other_models_get_prompts_as_they_are(vocabulary: Vocabulary) -> None:
     take_prompt(own, "the duck: 8K crown", "blurry, a cat with Wings", heard.append)
     assert own.told == ["a duck with a crown", "a cat with wings"]
     assert heard == ["prompt read as part: crown; body: duck; ignored: 8k"]
-    assert known_text("blurry", vocabulary) == ""
+    assert known_text("blurry", vocabulary) == "" and other.parts == own.parts == {}
+
+
+def test_the_prompts_of_parts_are_read_alike(vocabulary: Vocabulary) -> None:
+    other, own, heard = Listening(None), Listening(vocabulary), []
+    parts = {"hat": ("an elegant wizard hat", ""), "back": ("angelic wings", "blurry, a crown")}
+    take_prompt(other, "a cat", "", heard.append, "a cat", parts)
+    assert other.parts == parts and heard == []
+    take_prompt(own, "a kitten with wings and a hat", "", heard.append, "a grey cat", parts)
+    assert own.parts == {"hat": ("a cat with a wizard hat", ""), "back": ("a cat with wings", "a crown")}
+    assert [line.split(" read")[0] for line in heard] == ["prompt", "prompt of part 'hat'", "prompt of part 'back'"]
+    with pytest.raises(UserError, match="part 'hat': prompt 'a sofa'.*reword"):
+        take_prompt(own, "a cat with wings", "", heard.append, "a cat", {"hat": ("a sofa", "")})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import diffusers
 import pytest
 import torch
 
@@ -16,7 +17,13 @@ def latents(*values: float) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("sds", [0.75, 0.36]), ("uniform", [1, 1]), ("fantasia3d", [0.375, 0.288]), ("inverse", [4 / 3, 1 / 0.36])],
+    [
+        ("sds", [0.75, 0.36]),
+        ("uniform", [1, 1]),
+        ("fantasia3d", [0.375, 0.288]),
+        ("inverse", [4 / 3, 1 / 0.36]),
+        ("ism", [3**0.5, 0.75]),
+    ],
 )
 def test_weightings(name: str, expected: list[float]) -> None:
     assert sds.weight(name, torch.tensor([0.25, 0.64])).tolist() == pytest.approx(expected)
@@ -100,6 +107,21 @@ def test_ddim_step_keeps_the_line_from_latents_to_noise() -> None:
     high, low = torch.tensor([0.2]), torch.tensor([0.7])
     stepped = sds.ddim_step(sds.add_noise(z, noise, high), noise, high, low)
     torch.testing.assert_close(stepped, sds.add_noise(z, noise, low), rtol=1e-4, atol=1e-5)
+
+
+def test_v_at_zero_terminal_snr_says_the_clean_latents() -> None:
+    """alpha_bar = 0 at the last timestep (diffusers' `rescale_betas_zero_snr`): z_t is all noise, and z = -v."""
+    scheduler = diffusers.DDIMScheduler(rescale_betas_zero_snr=True, prediction_type="v_prediction", clip_sample=False)
+    assert scheduler.alphas_cumprod[-1] == 0
+    scheduler.set_timesteps(1000)
+    alpha_bar = sds.levels(scheduler.alphas_cumprod)[[999, 500]]
+    v, z_t = torch.randn(2, 2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+    noise = sds.noise_from_prediction(v, z_t, alpha_bar, "v_prediction")
+    z_hat = sds.clean_estimate(z_t, noise, alpha_bar)
+    torch.testing.assert_close(z_hat[0].float(), -v[0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(noise[0].float(), z_t[0], rtol=1e-5, atol=1e-5)
+    step = scheduler.step(v[1], 500, z_t[1])
+    torch.testing.assert_close(z_hat[1].float(), step.pred_original_sample, rtol=1e-4, atol=1e-4)
 
 
 def test_timesteps_fill_their_range_evenly() -> None:

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+from fd_mitsuba.backend.processes import started_with_others
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT, start
 from fd_mitsuba.errors import UserError
 
@@ -47,7 +48,7 @@ def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
     if threads > most_threads():
         raise UserError(f"-t {threads}: give 0 (all cores) or at most {most_threads()}, more only hinder each other")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    cores = threads or available_cores()
+    cores = threads or max(1, available_cores() // _local_processes())
     start(variant, threads if threads < 0 else renderer_threads(cores))
     import torch
 
@@ -60,6 +61,11 @@ def share_cores_once() -> None:
     """`share_cores` with all cores, unless it was called before."""
     if _cores is None:
         share_cores()
+
+
+def _local_processes() -> int:
+    """How many processes of the run are on this machine; they share its cores."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if started_with_others() else 1
 
 
 def available_cores() -> int:

@@ -16,6 +16,7 @@ from types import FrameType
 from typing import NoReturn
 
 from fd_mitsuba import __version__
+from fd_mitsuba.backend.processes import speaks_first
 from fd_mitsuba.cli.ablate import add_ablate_commands
 from fd_mitsuba.cli.batch import add_batch_commands
 from fd_mitsuba.cli.check import add_check_command
@@ -30,7 +31,7 @@ from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
 from fd_mitsuba.cli.run import add_run_command
-from fd_mitsuba.errors import Interrupted, UserError, out_of_memory, printable
+from fd_mitsuba.errors import Interrupted, RunStopped, UserError, out_of_memory, printable
 
 _LONGEST_USAGE = 300
 
@@ -50,12 +51,14 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return options.call(options)
     except Interrupted as stop:
-        remark(str(stop))
+        if speaks_first():
+            remark(str(stop))
         return 130
     except UserError as error:
         if verbose:
             raise
-        remark(f"error: {error}")
+        if speaks_first() or isinstance(error, RunStopped):
+            remark(f"error: {error}")
         return 1
     except (MemoryError, RuntimeError) as error:
         failure = out_of_memory(error)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.cli.options import remark, say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
 
@@ -58,6 +59,8 @@ def run_scene(options: argparse.Namespace) -> int:
         log=remark,
         command=options.command_line,
     )
+    if not processes().writes:
+        return 0
     metrics = run.metrics
     picture = "appearance" if "appearance" in metrics else "turntable"
     say(f"{run.folder}: part in export/, images in images/{picture}.png, all in report.html")

@@ -27,6 +27,8 @@ Neurons = Annotated[int, Field(ge=1, le=1024)]
 Cells = Annotated[int, Field(ge=1, le=1 << 20)]
 """Cells a side of one level of a hash grid."""
 Range = tuple[float, float]
+ModelName = Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""A hub id, a folder or a file."""
 MOST_SAMPLES = 2**32 - 1
 """What Dr.Jit can number in one array."""
 MOST_TURNTABLE_PIXELS = 10**9

@@ -27,7 +27,23 @@ from fd_mitsuba.errors import UserError
 
 _CHOICES = ("kind", "variant")
 """The settings of `guidance` that name an entry of a registry."""
-_NEWER = {"geometry.lambda_tether": 0.0, "geometry.start_variety": 0.0}
+_NEWER = {
+    "geometry.lambda_tether": 0.0,
+    "geometry.start_variety": 0.0,
+    "guidance.perp_neg": 0.0,
+    "guidance.mask_margin": 2,
+    "guidance.lora": [],
+    "guidance.lora_scale": 1.0,
+    "guidance.words": [],
+    "guidance.controlnet": "",
+    "guidance.controlnet_scale": 1.0,
+    "guidance.controlnet_sees": "depth",
+    "guidance.mask_channel": "auto",
+    "guidance.normal_augmentation": "none",
+    "guidance.refined_background": "black",
+    "guidance.reduction": "mean",
+    "appearance.soft_mask": False,
+}
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 
 

@@ -16,6 +16,7 @@ from fd_mitsuba.config.bounds import (
     GuidanceScale,
     Length,
     Levels,
+    ModelName,
     Neurons,
     Points,
     Range,
@@ -28,7 +29,7 @@ from fd_mitsuba.config.bounds import (
 )
 from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
-from fd_mitsuba.conventions import TextureChannel, Weighting
+from fd_mitsuba.conventions import NormalAugmentation, TextureChannel, Weighting
 
 
 class Section(BaseModel):
@@ -211,6 +212,8 @@ class AppearanceConfig(Section):
     """As `guidance.image_guidance_scale`, for this stage."""
     mask_guidance: bool = True
     """Noise and gradient only where the part is seen."""
+    soft_mask: bool = False
+    """They fade with the share of a latent cell that the part covers, instead of ending where it is below a tenth."""
     lambda_sds: Weight = 1.0
     """Weight of the guidance's loss."""
     style: bool = False
@@ -254,14 +257,30 @@ class GuidanceConfig(Section):
 
     kind: Choice = Choice(kind="diffusion")
     """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
-    model: Annotated[str, Field(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] = "builtin"
+    model: ModelName = "builtin"
     """`builtin`, a folder in Stable-Diffusion layout, or a hub id."""
+    lora: tuple[ModelName, ...] = ()
+    """LoRA files (.safetensors), or folders with one each, added to the model's weights."""
+    lora_scale: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)] = 1.0
+    """How much of each is added."""
+    words: tuple[ModelName, ...] = ()
+    """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
+    controlnet: ModelName = ""
+    """A ControlNet's folder or hub id, which is shown the surface in the appearance stage; none by default."""
+    controlnet_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
+    """How much the ControlNet steers."""
+    controlnet_sees: Literal["depth", "normal"] = "depth"
+    """What of the surface it is shown; what it was trained with."""
     variant: Choice = Choice(kind="sds")
     """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0
     """Weight of the base's image, for models with 8 input channels."""
+    perp_neg: Weight = 0.0
+    """Perp-Neg: weight of what the negative prompt asks for beside the prompt; 0: it stands for the empty text."""
+    mask_margin: Annotated[int, Field(ge=0, le=64)] = 2
+    """Inpainting models (9 input channels) repaint the focal regions and so many latent cells around them."""
     weighting: Weighting = "sds"
     """Weight of a timestep; `guidance.sds` has the formulas."""
     timestep_range_coarse: Range = (0.02, 0.35)
@@ -270,6 +289,14 @@ class GuidanceConfig(Section):
     """The same in the refined phase."""
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
     """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
+    mask_channel: Literal["auto", "unit", "signed"] = "auto"
+    """The coarse phase's mask: `unit` 0 to 1, as in the paper; `signed` -1 to 1; `auto`: `signed` for packed priors."""
+    normal_augmentation: NormalAugmentation = "none"
+    """Random turns of the coarse phase's normals, a view each: the paper names an augmentation and not which."""
+    refined_background: Literal["black", "grey", "white"] = "black"
+    """Behind the normals of the refined phase, as colours."""
+    reduction: Literal["mean", "sum"] = "mean"
+    """Of the gradients of a step's pictures."""
     normalise_gradient: bool = False
     """Bring the guidance's gradient to a fixed size, so that the other weights are relative to it."""
     views_per_call: Annotated[Views, MAY_CHANGE] = 4

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -18,48 +20,62 @@ from fd_mitsuba.guidance.variants import Chunk, Distillation, Query, passes_of
 class Denoiser:
     """The UNet with its noise schedule.
 
-    A UNet with 8 input channels sees a condition's latents beside z_t (`needs_base`), and may say only what must be
-    added to them (`adds_to_base`).
+    A UNet with 8 input channels sees a condition's latents beside z_t, and may say only what must be added to them
+    (`adds_to_base`); classifier-free guidance leaves the condition out of one pass (`has_image_pass`). One with 9 sees
+    a mask of what to repaint and the masked picture's latents in every pass (`inpaints`). Both need the base's pictures
+    (`needs_base`).
     """
 
     def __init__(self, components: Components, config: GuidanceConfig, device: str = "cpu") -> None:
         self.config = config
         self.components = components
         self.device = torch.device(device)
-        self.needs_base = components.unet.config.in_channels == 8
+        channels = components.unet.config.in_channels
+        self.has_image_pass, self.inpaints = channels == 8, channels == 9
+        self.needs_base = self.has_image_pass or self.inpaints
         self.adds_to_base = components.conventions.predicts == "difference"
         self.latent_size = latent_side(components.unet.config)
-        self.alpha_bars = components.scheduler.alphas_cumprod.to(device=self.device, dtype=torch.float32)
+        self.alpha_bars = sds.levels(components.scheduler.alphas_cumprod).to(self.device)
         self.prediction_type = components.scheduler.config.get("prediction_type", "epsilon")
         if self.prediction_type not in ("epsilon", "v_prediction", "sample"):
             raise UserError(
                 f"{components.folder / 'scheduler'}: prediction_type {self.prediction_type!r} is not known; take a "
                 "model with epsilon or v_prediction"
             )
-        if self.adds_to_base and not (self.needs_base and self.prediction_type == "sample"):
+        if self.adds_to_base and not (self.has_image_pass and self.prediction_type == "sample"):
             raise UserError(
                 f"{components.folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels and "
                 "prediction_type sample; remove the entry"
             )
 
     def predict_noise(
-        self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], condition: Tensor | None
+        self,
+        z_t: Tensor,
+        timesteps: Tensor,
+        texts: dict[str, Tensor],
+        condition: Tensor | None,
+        control: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Noise (N, 4, L, L), float32, of each pass that `texts` names, with at most `views_per_call` pictures at once.
 
         Args:
             z_t: noisy latents (N, 4, L, L); timesteps: (N,) int64.
-            texts: embeddings (N, length, width) for any of the passes `text`, `image`, `plain` (see `sds`).
+            texts: embeddings (N, length, width) for any of the passes `text`, `image`, `plain` (see `sds`), `negative`.
             condition: the base's latents (N, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
+                For 9 channels (N, 5, L, L), the mask first; all passes see it.
+            control: pictures (N, 3, H, H) in [0, 1] for the ControlNet, in all passes; None: it is not asked.
         """
         passes, unet = len(texts), self.components.unet
         inputs, seen = z_t, []
         if condition is not None:
-            seen = [torch.zeros_like(condition) if name == "plain" else condition for name in texts]
+            blind = "plain" if self.has_image_pass else None
+            seen = [torch.zeros_like(condition) if name == blind else condition for name in texts]
             inputs = torch.cat([z_t.repeat(passes, 1, 1, 1), torch.cat(seen)], dim=1)
         elif passes > 1:
             inputs = z_t.repeat(passes, 1, 1, 1)
         columns = inputs.to(unet.dtype), timesteps.repeat(passes), torch.cat(list(texts.values())).to(unet.dtype)
+        if control is not None:
+            columns += z_t.repeat(passes, 1, 1, 1).to(unet.dtype), control.repeat(passes, 1, 1, 1).to(unet.dtype)
         cores = cores_for_samples(unet, self.device)
         outputs = of_samples(self._unet, columns, self.config.views_per_call, cores)
         if self.adds_to_base:
@@ -70,15 +86,25 @@ class Denoiser:
             for name, output in zip(texts, outputs.chunk(passes), strict=True)
         }
 
-    def _unet(self, inputs: Tensor, times: Tensor, texts: Tensor) -> Tensor:
-        return self.components.unet(inputs, times, encoder_hidden_states=texts, return_dict=False)[0].float()
+    def _unet(
+        self, inputs: Tensor, times: Tensor, texts: Tensor, z_t: Tensor | None = None, control: Tensor | None = None
+    ) -> Tensor:
+        known: dict[str, Any] = {"encoder_hidden_states": texts, "return_dict": False}
+        if control is not None:
+            assert self.components.controlnet is not None
+            down, middle = self.components.controlnet(
+                z_t, times, controlnet_cond=control, conditioning_scale=self.config.controlnet_scale, **known
+            )
+            known |= {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
+        return self.components.unet(inputs, times, **known)[0].float()
 
     def passes(self, how: Distillation) -> tuple[str, ...]:
         """Names of the network's passes that the variant and the scales ask for."""
-        return passes_of(how, self.needs_base)
+        return passes_of(how, self.has_image_pass)
 
     @torch.no_grad()
     def latent_gradient(self, chunk: Chunk, how: Distillation) -> tuple[Tensor, Tensor]:
         """Gradient with respect to z, and the clean latents that the network sees in z_t."""
         gradient, preview = how.variant.gradient(Query(self, chunk, how))
+        gradient, preview = gradient.to(chunk.z.dtype), preview.to(chunk.z.dtype)
         return gradient if chunk.mask is None else gradient * chunk.mask, preview

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import torch
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.errors import UserError
+
+
+def own_device(name: str) -> str:
+    """The device of a name for this process: `cuda` is a card of its own for each of several processes."""
+    group = processes()
+    if name != "cuda" or group.local_count == 1:
+        return name
+    return f"cuda:{group.local_rank % max(torch.cuda.device_count(), 1)}"
 
 
 def require_device(name: str, setting: str = "guidance.device") -> torch.device:

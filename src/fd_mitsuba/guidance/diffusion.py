@@ -7,26 +7,30 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.colour_latents import colour_latents
 from fd_mitsuba.guidance.denoiser import Denoiser
-from fd_mitsuba.guidance.device import require_device
+from fd_mitsuba.guidance.device import own_device, require_device
+from fd_mitsuba.guidance.inpainting import masked_base, repaint_mask
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
+from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
+from fd_mitsuba.guidance.picture_latents import PictureLatents
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
-from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation
+from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -36,9 +40,9 @@ class DiffusionGuidance(Denoiser):
     """Score distillation with Stable Diffusion 1.x/2.x or an InstructPix2Pix model; see `interface.Guidance`.
 
     A UNet with 8 input channels sees the base's latents of the same view beside z_t and takes `image_guidance_scale` as
-    second scale. In the coarse phase (normal times coverage, 2 mask - 1) stands for scaled latents; in the refined
-    phase the normals, as colours on black, go through the VAE encoder (its mean: only t and the noise are random), and
-    so do the colours of the appearance stage, unless the model's conventions say `area_mean_shine`.
+    second scale; one with 9 sees the base without the focal regions, grown by `mask_margin`, which it is to fill.
+
+    `PictureLatents` says how pictures become latents.
     """
 
     def __init__(
@@ -52,16 +56,17 @@ class DiffusionGuidance(Denoiser):
         self.appearance = appearance or AppearanceConfig()
         self.variant = VARIANTS.make(config.variant, "guidance.variant")
         self.conventions = components.conventions
+        if config.perp_neg and "guided" not in self.variant.passes:
+            raise UserError(
+                f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
+            )
         self.view_grid = components.conventions.view_grid
         self.normal_space = components.conventions.normal_space
-        vae = components.vae.config
-        self._sees_shine = components.conventions.latents == "area_mean_shine"
-        self.vae_scale_factor = 2 ** (len(vae.get("encoder_block_out_channels") or vae.block_out_channels) - 1)
-        self.scaling_factor = float(vae.get("scaling_factor") or 1.0)
-        self.shift_factor = float(vae.get("shift_factor") or 0.0)
-        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device)
+        self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
+        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None
         self._negative_prompt = ""
+        self._part_prompts: dict[str, tuple[str, str]] = {}
 
     @classmethod
     def load(
@@ -74,7 +79,7 @@ class DiffusionGuidance(Denoiser):
             appearance: the settings of `guide_appearance`. With them the model `builtin` is the prior of colours, which
                 serves that stage alone; a real model serves both.
         """
-        place = str(require_device(device or config.device))
+        place = str(require_device(device or own_device(config.device)))
         return cls(load_components(config, place, appearance is not None), config, place, appearance)
 
     def for_appearance(self, appearance: AppearanceConfig) -> DiffusionGuidance:
@@ -85,8 +90,8 @@ class DiffusionGuidance(Denoiser):
 
     def picture_size(self, phase: Phase) -> int:
         """Side in pixels of one view: the latents' own in the coarse phase, the VAE's input in the others."""
-        at_latent_size = phase == "coarse" or (phase == "appearance" and self._sees_shine)
-        return self.latent_size * (1 if at_latent_size else self.vae_scale_factor) // self.view_grid
+        at_latent_size = phase == "coarse" or (phase == "appearance" and self.latents.sees_shine)
+        return self.latent_size * (1 if at_latent_size else self.latents.vae_scale_factor) // self.view_grid
 
     @property
     def appearance_size(self) -> int:
@@ -100,12 +105,35 @@ class DiffusionGuidance(Denoiser):
             return []
         return unknown_words(self.components.tokenizer, f"{prompt} {negative_prompt}")
 
-    def prompts(self, views: GuidanceViews | AppearanceViews) -> list[str]:
-        """The text of each picture or mosaic; a mosaic goes by its first view."""
-        if self._prompt is None:
+    def set_part_prompts(self, prompts: Mapping[str, tuple[str, str]]) -> None:
+        """Take part -> (prompt, negative prompt) of the parts that have their own; "" is the scene's negative prompt.
+
+        Where a part's focal regions are seen (`GuidanceViews.regions`), the network's noise is what it sees with these
+        texts, elsewhere what it sees with those of `set_prompt`: one pass of the network more for each such part.
+        """
+        self._part_prompts = dict(prompts)
+
+    @property
+    def region_size(self) -> int | None:
+        """Side in pixels of `GuidanceViews.regions`; None where they are not looked at."""
+        return self.latent_size // self.view_grid if self._part_prompts or self.inpaints else None
+
+    @property
+    def control_sees(self) -> str | None:
+        """What a ControlNet is shown in the appearance stage: `depth` or `normal`; None: there is none."""
+        return self.config.controlnet_sees if self.components.controlnet is not None else None
+
+    def prompts(self, views: GuidanceViews | AppearanceViews, text: str | None = None) -> list[str]:
+        """The text of each picture or mosaic; a mosaic goes by its first view.
+
+        Args:
+            text: a part's, in place of the scene's prompt.
+        """
+        text = self._prompt if text is None else text
+        if text is None:
             raise ValueError("set_prompt must be called before guide")
         return [
-            view_prompt(self._prompt, float(azimuth), views.closeup, self.conventions, self.config.view_prompts)
+            view_prompt(text, float(azimuth), views.closeup, self.conventions, self.config.view_prompts)
             for azimuth in list(views.azimuth_deg)[:: self.view_grid**2]
         ]
 
@@ -124,67 +152,57 @@ class DiffusionGuidance(Denoiser):
         size, wanted = views.pictures.shape[-1], self.picture_size(phase)
         if size != wanted:
             raise ValueError(f"the {phase} phase takes pictures of {wanted} x {wanted}, not {size} x {size}")
-        images, base = self._images(views.pictures, views.base, phase)
-        drawn = self._draw(len(images), step, steps_total, phase, seed)
-        return self._distil(images, base, self.prompts(views), phase, *drawn)
+        pictures, shown = views.pictures, views.base
+        if phase == "coarse" and self.config.normal_augmentation != "none":
+            share, total = _share(views)
+            generator = _generator(seed, step, phase, 1)
+            turns = random_turns(total, self.config.normal_augmentation, generator)[share]
+            pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
+        images, base = self._images(pictures, shown, phase)
+        drawn = self._draw_for(views, step, steps_total, phase, seed)
+        return self._distil(images, base, views, phase, *drawn)
 
     @network_threads()
     def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
         """As `guide`, for colours, with the settings of the appearance stage (paper, "Appearance Editing").
 
         Pictures of any size are resized to what the model takes. With `appearance.mask_guidance` noise and gradient are
-        multiplied by the part's mask at the latents' size: 1 where the part covers at least `MASK_THRESHOLD` of a cell.
+        multiplied by the part's mask at the latents' size: 1 where the part covers at least `MASK_THRESHOLD` of a cell,
+        or with `appearance.soft_mask` the share that it covers.
         """
         pictures, condition = views.pictures, views.condition
-        if self._sees_shine:
+        if self.latents.sees_shine:
             pictures = torch.cat([pictures, views.shine], dim=1)
             condition = None if condition is None else torch.cat([condition, views.part_mask], dim=1)
         images, base = self._images(pictures, condition, "appearance")
         mask = None
         if self.appearance.mask_guidance:
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
-            mask = (adaptive_avg_pool2d(part, self.latent_size) >= MASK_THRESHOLD).to(images.dtype)
-        drawn = self._draw(len(images), step, steps_total, "appearance", seed)
-        return self._distil(images, base, self.prompts(views), "appearance", *drawn, mask)
+            share = adaptive_avg_pool2d(part, self.latent_size)
+            mask = share if self.appearance.soft_mask else (share >= MASK_THRESHOLD).to(images.dtype)
+        drawn = self._draw_for(views, step, steps_total, "appearance", seed)
+        return self._distil(images, base, views, "appearance", *drawn, mask)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
-        """Scaled latents z (N, 4, L, L) of pictures or mosaics. Gradients flow.
-
-        Of geometry pictures (N, 5, H, H), coarse: (n coverage, 2 mask - 1) as it is; refined:
-        scaling_factor (E(2 (n + mask) / 2 - 1) - shift_factor). Of colours c (N, 3, H, H): the same with E(2 c - 1), or
-        `colour_latents` of colours and shine (N, 4, H, H).
-        """
-        if phase == "appearance":
-            if self._sees_shine:
-                return colour_latents(images.float(), self.latent_size)
-            side = self.latent_size * self.vae_scale_factor
-            pictures = images.float()
-            if pictures.shape[-1] != side:
-                pictures = interpolate(pictures, size=(side, side), mode="bilinear", antialias=True)
-            return self._through_vae(2 * pictures - 1)
-        normal, mask = images[:, :3], images[:, 3:4]
-        if phase == "coarse":
-            return torch.cat([normal, 2 * mask - 1], dim=1).float()
-        # (n + 1) / 2 on covered pixels over black is (n coverage + mask) / 2; the VAE takes twice that less 1.
-        return self._through_vae((normal + mask - 1).float())
-
-    def _through_vae(self, pictures: Tensor) -> Tensor:
-        encoded = self.components.vae.encode(pictures)
-        latents = encoded.latents if hasattr(encoded, "latents") else encoded.latent_dist.mean
-        return (latents - self.shift_factor) * self.scaling_factor
+        """Scaled latents z (N, 4, L, L) of pictures or mosaics; see `PictureLatents`. Gradients flow."""
+        return self.latents(images, phase)
 
     def _distil(
         self,
         images: Tensor,
         base: Tensor | None,
-        prompts: list[str],
+        views: GuidanceViews | AppearanceViews,
         phase: Phase,
         timesteps: Tensor,
         noise: Tensor,
         mask: Tensor | None = None,
     ) -> GuidanceResult:
-        how, count = self._how(phase), len(images)
-        texts = self.embeddings(prompts, self.passes(how))
+        how, count, (_, total) = self._how(phase), len(images), _share(views)
+        total //= self.view_grid**2
+        texts = self.embeddings(self.prompts(views), self.passes(how))
+        areas = self._areas(views, self.passes(how))
+        holes = self._holes(views) if self.inpaints else None
+        control = self._control(views)
         rows_per_chunk = max(1, self.config.views_per_call // len(texts))
         track = images.requires_grad and torch.is_grad_enabled()
 
@@ -199,8 +217,10 @@ class DiffusionGuidance(Denoiser):
                 noise=noise[rows],
                 timesteps=timesteps[rows],
                 texts={name: embedding[rows] for name, embedding in texts.items()},
-                condition=None if base is None else self._condition(base[rows], phase),
+                condition=self._condition(base, holes, rows, phase),
                 mask=None if mask is None else mask[rows],
+                areas=tuple(area.rows(rows) for area in areas),
+                control=None if control is None else control[rows],
             )
             gradient, preview = self.latent_gradient(chunk, how)
             self._check_finite(gradient, chunk.timesteps, "latents")
@@ -212,9 +232,9 @@ class DiffusionGuidance(Denoiser):
 
         gradient = torch.cat(latent_gradients)
         # The way back to the pictures is linear, so that it may be scaled at its end, when all chunks are known.
-        scale = 1 / count
+        scale = 1 / total if self.config.reduction == "mean" else 1.0
         if self.config.normalise_gradient:
-            scale *= sds.normalising_scale(gradient, mask)
+            scale *= sds.normalising_scale(gradient, mask) if total == count else _scale_of_all(gradient, mask)
         value = 0.5 * scale * float(gradient.square().sum())
         loss = images.new_tensor(value)
         if track:
@@ -235,13 +255,39 @@ class DiffusionGuidance(Denoiser):
             settings = self.config
             bounds = settings.timestep_range_refined if phase == "refined" else settings.timestep_range_coarse
         return Distillation(
-            self.variant, settings.weighting, settings.guidance_scale, settings.image_guidance_scale, bounds
+            self.variant,
+            settings.weighting,
+            settings.guidance_scale,
+            settings.image_guidance_scale,
+            bounds,
+            self.config.perp_neg,
         )
 
-    def embeddings(self, prompts: list[str], passes: Iterable[str]) -> dict[str, Tensor]:
-        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt."""
-        negative = [self._negative_prompt] * len(prompts)
-        return {name: self._embed(prompts if name == "text" else negative) for name in passes}
+    def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
+        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt.
+
+        Args:
+            negative: in place of that of `set_prompt`.
+        """
+        against = negative or self._negative_prompt
+        read = {"text": prompts, "negative": [against] * len(prompts)}
+        without = ["" if self.config.perp_neg else against] * len(prompts)
+        return {name: self._embed(read.get(name, without)) for name in passes}
+
+    def _areas(self, views: GuidanceViews | AppearanceViews, passes: Iterable[str]) -> tuple[Area, ...]:
+        """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out."""
+        found = []
+        for part, (prompt, negative) in self._part_prompts.items():
+            if part not in views.regions:
+                raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
+            own = {"text"} if negative in ("", self._negative_prompt) else set(passes)
+            if self.config.perp_neg:
+                own &= {"text", "negative"}
+            mask = tile_views(views.regions[part], self.view_grid).to(self.device)
+            names = [name for name in passes if name in own]
+            texts = self.embeddings(self.prompts(views, prompt), names, negative)
+            found.append(Area(adaptive_avg_pool2d(mask, self.latent_size), texts))
+        return tuple(found)
 
     def _images(self, pictures: Tensor, base: Tensor | None, phase: Phase) -> tuple[Tensor, Tensor | None]:
         """Pictures and, if the model sees it, the base, as mosaics on the network's device."""
@@ -253,15 +299,59 @@ class DiffusionGuidance(Denoiser):
         images = tile_views(pictures, self.view_grid).to(self.device)
         return images, tile_views(base, self.view_grid).to(self.device).detach() if self.needs_base else None
 
+    def _condition(self, base: Tensor | None, holes: Tensor | None, rows: slice, phase: Phase) -> Tensor | None:
+        """What the network sees of the base beside z_t, for some of the pictures."""
+        if base is None:
+            return None
+        return self.seen_base(base[rows], phase) if holes is None else self.seen_around(base[rows], holes[rows], phase)
+
     @torch.no_grad()
-    def _condition(self, base: Tensor, phase: Phase) -> Tensor:
-        """The base's latents as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
-        return self.encode(base, phase) / self.scaling_factor + self.shift_factor
+    def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
+        """The base's latents (N, 4, L, L) as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
+        return self.latents.unscaled(self.encode(base, phase))
+
+    @torch.no_grad()
+    def seen_around(self, base: Tensor, holes: Tensor, phase: Phase) -> Tensor:
+        """(N, 5, L, L) as inpainting models take it: the holes, and the scaled latents of the base without them.
+
+        Args:
+            holes: (N, 1, L, L), 1 where the model is to paint, 0 elsewhere.
+        """
+        return torch.cat(
+            [holes, self.encode(masked_base(base, holes, phase, self.latents.empty_mask(phase)), phase)], dim=1
+        )
+
+    def _control(self, views: GuidanceViews | AppearanceViews) -> Tensor | None:
+        """(N, 3, H, H) for the ControlNet at the size of the VAE's input; None in the geometry stage."""
+        if self.control_sees is None or not isinstance(views, AppearanceViews):
+            return None
+        if views.control is None:
+            raise ValueError(f"the ControlNet needs the surface's {self.control_sees} of the same views")
+        return self.latents.resized(tile_views(views.control.detach(), self.view_grid).to(self.device).float())
+
+    def _holes(self, views: GuidanceViews | AppearanceViews) -> Tensor:
+        if not views.regions:
+            raise UserError(
+                f"{self.components.folder}: an inpainting model (9 input channels) is told by a mask what to paint, "
+                "and the views come without one; give GuidanceViews.regions"
+            )
+        part_mask = views.part_mask if isinstance(views, AppearanceViews) else None
+        margin = self.config.mask_margin
+        return repaint_mask(views.regions, part_mask, self.view_grid, self.latent_size, margin).to(self.device)
+
+    def _draw_for(
+        self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """`_draw` for these of the step's views."""
+        share, total = _share(views)
+        grid = self.view_grid**2
+        timesteps, noise = self._draw(total // grid, step, steps_total, phase, seed)
+        own = slice(share.start // grid, share.stop // grid)
+        return timesteps[own], noise[own]
 
     def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
-        key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase)))
-        generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
+        generator = _generator(seed, step, phase)
         config, bounds = self.config, self._how(phase).timestep_range
         progress, levels = min(step / max(steps_total - 1, 1), 1.0), len(self.alpha_bars)
         if config.timestep_annealing == "none":
@@ -279,3 +369,25 @@ class DiffusionGuidance(Denoiser):
                 f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
                 "lower guidance.guidance_scale"
             )
+
+
+def _generator(seed: int, step: int, phase: Phase, *purpose: int) -> torch.Generator:
+    """Random numbers of a step; each purpose beside t and the noise has its own."""
+    key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase), *purpose))
+    return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
+
+
+def _share(views: GuidanceViews | AppearanceViews) -> tuple[slice, int]:
+    """Which of the step's views these are, and how many there are in all processes."""
+    own = len(views.pictures)
+    if views.share is None:
+        return slice(0, own), own
+    return views.share, own * processes().count
+
+
+def _scale_of_all(gradient: Tensor, mask: Tensor | None) -> float:
+    """`sds.normalising_scale` over the views of all processes."""
+    size = gradient.abs()
+    covered = torch.ones_like(size) if mask is None else (mask.expand_as(size) > 0).to(size.dtype)
+    total, cells = (processes().sum(float(values.sum())) for values in (size * covered, covered))
+    return cells / max(total, torch.finfo(gradient.dtype).tiny) if cells else 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -30,6 +30,9 @@ class GuidanceViews:
         azimuth_deg: B azimuths. A model that sees a mosaic takes consecutive views as one mosaic.
         elevation_deg: B elevations.
         closeup: whether the cameras are centred on the focal regions and close.
+        regions: part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first; given to
+            a guidance that has a `region_size`, which is R.
+        share: which of the step's views these are, where several processes share them; None: they are all.
     """
 
     pictures: torch.Tensor
@@ -37,6 +40,8 @@ class GuidanceViews:
     azimuth_deg: Sequence[float]
     elevation_deg: Sequence[float]
     closeup: bool = False
+    regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    share: slice | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
@@ -59,7 +64,8 @@ class AppearanceViews:
         part_mask: (B, 1, H, H) the part's coverage in [0, 1].
         shine: (B, 1, H, H) `colour_latents.shine` of the part times its coverage, for models that look at it. Gradients
             flow to it.
-        azimuth_deg, elevation_deg, closeup: as in `GuidanceViews`.
+        azimuth_deg, elevation_deg, closeup, regions, share: as in `GuidanceViews`.
+        control: (B, 3, H, H) in [0, 1] what a ControlNet is shown of the surface, for a guidance with `control_sees`.
     """
 
     pictures: torch.Tensor
@@ -70,15 +76,18 @@ class AppearanceViews:
     azimuth_deg: Sequence[float]
     elevation_deg: Sequence[float]
     closeup: bool = False
+    regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    share: slice | None = None
+    control: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
         if len(shape) != 4 or shape[1] != 3 or shape[2] != shape[3]:
             raise ValueError(f"pictures must be (B, 3, H, H), not {shape}")
-        if self.condition is not None and tuple(self.condition.shape) != shape:
-            raise ValueError(
-                f"the condition {tuple(self.condition.shape)} must have the shape of the pictures, {shape}"
-            )
+        for name in ("condition", "control"):
+            given = getattr(self, name)
+            if given is not None and tuple(given.shape) != shape:
+                raise ValueError(f"the {name} {tuple(given.shape)} must have the shape of the pictures, {shape}")
         for name in ("mask", "part_mask", "shine"):
             if tuple(getattr(self, name).shape) != (shape[0], 1, *shape[2:]):
                 raise ValueError(f"{name} must be {(shape[0], 1, *shape[2:])}, not {tuple(getattr(self, name).shape)}")
@@ -100,7 +109,11 @@ class GuidanceResult:
 
 
 class Guidance(Protocol):
-    """A source of guidance. `DiffusionGuidance` is the one the package ships."""
+    """A source of guidance. `DiffusionGuidance` is the one the package ships.
+
+    Optional, for scenes whose focal regions have prompts: `set_part_prompts(prompts)` takes part -> (prompt, negative
+    prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
+    """
 
     needs_base: bool
     """Whether `GuidanceViews.base` must be given."""
@@ -128,7 +141,10 @@ class Guidance(Protocol):
 
 
 class AppearanceGuidance(Protocol):
-    """A source of guidance for the appearance stage."""
+    """A source of guidance for the appearance stage.
+
+    Optional, beside what `Guidance` names: `control_sees`, `depth` or `normal`, asks for `AppearanceViews.control`.
+    """
 
     needs_base: bool
     """Whether `AppearanceViews.condition` must be given."""

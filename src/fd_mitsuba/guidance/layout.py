@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from fd_mitsuba.errors import UserError, first_line
+from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
 
-LAYOUT = "only Stable Diffusion 1.x/2.x and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
+LAYOUT = "only Stable Diffusion 1.x/2.x, inpainting and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
 WEIGHTS = {
     "unet": "diffusion_pytorch_model",
     "vae": "diffusion_pytorch_model",
@@ -26,6 +26,8 @@ CLASSES = {
     "tokenizer": {"CLIPTokenizer", "CLIPTokenizerFast", "PreTrainedTokenizerFast"},
     "scheduler": None,
 }
+_UNREAD = {"safety_checker", "feature_extractor", "image_encoder"}
+"""Components that a pipeline may have and that take no part in what its UNet sees."""
 
 
 def read_layout(folder: Path) -> dict[str, Any]:
@@ -46,6 +48,9 @@ def read_layout(folder: Path) -> dict[str, Any]:
             raise UserError(f"{path}: the pipeline {name} has no {part}; {LAYOUT}")
         if classes is not None and found not in classes:
             raise UserError(f"{path}: {part} is a {found}, not a {' or '.join(sorted(classes))}; {LAYOUT}")
+    for part, entry in index.items():
+        if isinstance(entry, list) and entry and entry[0] is not None and part not in CLASSES.keys() | _UNREAD:
+            raise UserError(f"{path}: the pipeline {name} has a {part} besides, which would be left out; {LAYOUT}")
     needed = [f"{part}/config.json" for part in WEIGHTS] + ["scheduler/scheduler_config.json", "tokenizer"]
     for name in needed:
         if not (folder / name).exists():
@@ -57,12 +62,12 @@ def read_layout(folder: Path) -> dict[str, Any]:
     return index
 
 
-def weight_files(folder: Path, part: str) -> tuple[list[Path], str | None]:
+def weight_files(folder: Path, part: str, stem: str | None = None) -> tuple[list[Path], str | None]:
     """The safetensors files of a component and their variant (None, or `fp16` where only that is there).
 
     Pickled weights (`.bin`, `.ckpt`) are refused: loading them runs whatever code they hold.
     """
-    stem = WEIGHTS[part]
+    stem = stem or WEIGHTS[part]
     for variant in (None, "fp16"):
         name = f"{stem}.safetensors" if variant is None else f"{stem}.{variant}.safetensors"
         listing = f"{stem}.safetensors.index.json" if variant is None else f"{stem}.safetensors.index.{variant}.json"
@@ -92,7 +97,9 @@ def count_weights(path: Path) -> int:
     try:
         with safe_open(path, framework="pt") as tensors:
             return sum(torch.Size(tensors.get_slice(key).get_shape()).numel() for key in tensors.keys())  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, MemoryError) as error:
+        if problem := out_of_memory(error):
+            raise UserError(f"{path}: {problem}") from None
         raise UserError(f"{path}: damaged weights ({first_line(error)}); copy or fetch the file again") from None
 
 
@@ -106,13 +113,19 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
     unet, vae, text = (configs[part] for part in ("unet", "vae", "text_encoder"))
     path = folder / "unet" / "config.json"
     channels, latent = unet.get("in_channels", 4), vae.get("latent_channels", 4)
-    if channels not in (4, 8):
-        kind = "an inpainting UNet" if channels == 9 else "not supported"
-        raise UserError(f"{path}: in_channels is {channels} ({kind}); take a model with 4, or 8 (InstructPix2Pix)")
+    if channels not in (4, 8, 9):
+        raise UserError(
+            f"{path}: in_channels is {channels}; take a model with 4, 8 (InstructPix2Pix) or 9 (inpainting)"
+        )
     if latent != 4 or unet.get("out_channels", 4) != 4:
         raise UserError(f"{path}: UNet and VAE must share 4 latent channels; take a Stable Diffusion 1.x/2.x model")
     if not isinstance(unet.get("sample_size") or 64, int) and len(set(unet["sample_size"])) != 1:
         raise UserError(f"{path}: sample_size {unet['sample_size']} is not square; take a model with square pictures")
+    if unet.get("time_cond_proj_dim") is not None:
+        raise UserError(
+            f"{path}: time_cond_proj_dim = {unet['time_cond_proj_dim']!r}: a latent consistency model, which was "
+            "distilled to jump to the end and tells no noise; take the model that it was made from"
+        )
     for key in ("addition_embed_type", "class_embed_type", "encoder_hid_dim"):
         if unet.get(key) is not None:
             raise UserError(f"{path}: {key} = {unet[key]!r} asks for a condition beside the text; {LAYOUT}")
@@ -126,7 +139,7 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
             f"{folder / FILE_NAME}: view_grid {conventions.view_grid} does not divide the latents' side "
             f"{latent_side(unet)}; mend view_grid"
         )
-    if conventions.needs_base is not None and conventions.needs_base != (channels == 8):
+    if conventions.needs_base is not None and conventions.needs_base != (channels != 4):
         raise UserError(
             f"{folder / FILE_NAME}: needs_base is {conventions.needs_base} but the UNet has {channels} input "
             "channels; mend needs_base"

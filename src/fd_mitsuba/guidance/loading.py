@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.errors import UserError, first_line
+from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
+from fd_mitsuba.guidance.control import check_controlnet, locate_controlnet
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
     WEIGHTS,
@@ -23,6 +24,8 @@ from fd_mitsuba.guidance.layout import (
     read_layout,
     weight_files,
 )
+from fd_mitsuba.guidance.learned_words import add_word
+from fd_mitsuba.guidance.lora import add_lora
 from fd_mitsuba.guidance.memory import BYTES, require_memory, working_set_bytes
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
 from fd_mitsuba.io.hub import hub_snapshot, is_offline, local_folder
@@ -43,6 +46,9 @@ class Components:
     scheduler: Any
     conventions: ModelConventions
     folder: Path
+    words: dict[str, str] = field(default_factory=dict)
+    """Learned words, and the tokens that stand for them."""
+    controlnet: torch.nn.Module | None = None
 
 
 def load_components(config: GuidanceConfig, device: str = "cpu", appearance: bool = False) -> Components:
@@ -64,16 +70,36 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     check_sizes(folder, configs, conventions)
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
+    if (config.lora or config.words or config.controlnet) and config.model == "builtin":
+        raise UserError(
+            "guidance.lora, words and controlnet are made for Stable Diffusion; set guidance.model to such a model"
+        )
+    control, control_weights, control_variant = None, 0, None
+    if config.controlnet:
+        control = locate_controlnet(config.controlnet)
+        control_weights, control_variant = check_controlnet(control, configs["unet"])
     size = BYTES[config.dtype]
     text_size = size if torch.device(device).type == "cpu" else 0
     latent_size = latent_side(configs["unet"])
     require_memory(
-        counts["unet"] * size + counts["text_encoder"] * text_size + counts["vae"] * 4,
+        (counts["unet"] + control_weights) * size + counts["text_encoder"] * text_size + counts["vae"] * 4,
         working_set_bytes(configs["unet"], configs["vae"], latent_size, config.views_per_call, config.dtype),
         device,
         str(folder),
     )
-    return _load(folder, index, {part: variant for part, (_, variant) in files.items()}, config, conventions, device)
+    variants = {part: variant for part, (_, variant) in files.items()}
+    loaded = _with_additions(_load(folder, index, variants, config, conventions, device), config)
+    if control is None:
+        return loaded
+    return replace(loaded, controlnet=_load_controlnet(control, control_variant, config, device))
+
+
+def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
+    """The components after LoRA files and learned words were added to them."""
+    for path in config.lora:
+        add_lora(Path(path).expanduser(), config.lora_scale, loaded.unet, loaded.text_encoder)
+    words = [add_word(Path(path).expanduser(), loaded.tokenizer, loaded.text_encoder) for path in config.words]
+    return replace(loaded, words=dict(words))
 
 
 def locate(model: str, appearance: bool = False) -> Path:
@@ -126,21 +152,8 @@ def _load(
         ("text_encoder", transformers.CLIPTextModel, dtype if on_cpu else torch.float32),
     ):
         key = "torch_dtype" if part != "text_encoder" else "dtype"
-        with _one_line(folder / part), _quiet():
-            model, info = owner.from_pretrained(
-                str(folder / part),
-                variant=variants[part],
-                use_safetensors=True,
-                local_files_only=True,
-                output_loading_info=True,
-                **{key: kind},
-            )
-        missing = sorted(info["missing_keys"])
-        if missing:
-            raise UserError(
-                f"{folder / part}: the weights lack {len(missing)} tensors, {missing[0]} first; fetch the file again"
-            )
-        loaded[part] = model.requires_grad_(False).eval().to("cpu" if part == "text_encoder" else device)
+        model = _network(owner, folder / part, variants[part], **{key: kind})
+        loaded[part] = model.to("cpu" if part == "text_encoder" else device)
     with _one_line(folder / "tokenizer"), _quiet():
         # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
@@ -158,6 +171,29 @@ def _load(
     return Components(tokenizer, loaded["text_encoder"], loaded["unet"], loaded["vae"], scheduler, conventions, folder)
 
 
+def _load_controlnet(folder: Path, variant: str | None, config: GuidanceConfig, device: str) -> torch.nn.Module:
+    import diffusers
+
+    kind = getattr(torch, config.dtype)
+    return _network(diffusers.ControlNetModel, folder, variant, torch_dtype=kind).to(device)
+
+
+def _network(owner: Any, folder: Path, variant: str | None, **kind: torch.dtype) -> torch.nn.Module:
+    with _one_line(folder), _quiet():
+        model, info = owner.from_pretrained(
+            str(folder),
+            variant=variant,
+            use_safetensors=True,
+            local_files_only=True,
+            output_loading_info=True,
+            **kind,
+        )
+    missing = sorted(info["missing_keys"])
+    if missing:
+        raise UserError(f"{folder}: the weights lack {len(missing)} tensors, {missing[0]} first; fetch the file again")
+    return model.requires_grad_(False).eval()
+
+
 @contextlib.contextmanager
 def _one_line(path: Path) -> Iterator[None]:
     """Turn whatever the libraries raise on a file that does not fit its config into one line that names the place."""
@@ -166,6 +202,8 @@ def _one_line(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
+        if problem := out_of_memory(error):
+            raise UserError(f"{path}: {problem}, or set guidance.dtype=bfloat16") from None
         raise UserError(f"{path}: cannot be loaded ({first_line(error)}); copy or fetch the model again") from None
 
 

@@ -66,12 +66,31 @@ def _sysconf_available() -> int | None:
         return None
 
 
-def _cgroup_available(root: Path = Path("/sys/fs/cgroup")) -> int | None:
+def _cgroup_available(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+    """What the tightest of the process's control groups leaves: its own, or any that this is nested in."""
+    group = _own_group(own)
+    levels = [root / path for path in (group, *group.parents)]
+    known = [amount for level in levels if (amount := _left_in_group(level)) is not None]
+    return min(known) if known else None
+
+
+def _own_group(own: Path) -> Path:
+    """The process's group below the root of version 2; the root itself where the system does not say."""
     try:
-        limit = int((root / "memory.max").read_text())
-        used = int((root / "memory.current").read_text())
+        lines = own.read_text().splitlines()
+    except OSError:
+        return Path()
+    paths = [line.removeprefix("0::") for line in lines if line.startswith("0::")]
+    parts = [part for part in paths[0].split("/") if part not in ("", "..")] if paths else []
+    return Path(*parts)
+
+
+def _left_in_group(group: Path) -> int | None:
+    try:
+        limit = int((group / "memory.max").read_text())
+        used = int((group / "memory.current").read_text())
         # The page cache counts as used but is given up under pressure.
-        statistics = dict(line.split() for line in (root / "memory.stat").read_text().splitlines())
+        statistics = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         return limit - used + int(statistics.get("inactive_file", 0))
     except (OSError, ValueError):
         return None

@@ -25,7 +25,7 @@ class ModelConventions(BaseModel):
     normal_space: Literal["camera", "world"] | None = None
     """Frame of the normals in the training pictures; None: the weights do not care."""
     needs_base: bool | None = None
-    """If given, must agree with the UNet: 8 input channels take the base's picture as condition, 4 do not."""
+    """If given, must agree with the UNet: 8 and 9 input channels take the base's picture as condition, 4 do not."""
     condition: Literal["base", "clay"] | None = None
     """What the condition picture shows: the base alone, or the part on it in grey clay. For people, not checked."""
     latents: Literal["vae", "area_mean_shine"] = "vae"
@@ -50,6 +50,11 @@ class ModelConventions(BaseModel):
     """The words that the model knows, if they can be listed; a prompt that asks for no known part is refused."""
     about: dict[str, Any] = {}
     """Free remarks (training data, licence); not read."""
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether they were written for a prior of this package, which knows whole words."""
+        return self.whole_words or self.vocabulary is not None
 
     @model_validator(mode="after")
     def _template_fields_exist(self) -> ModelConventions:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -65,12 +65,20 @@ class TextEmbeddings:
         tokenizer: a CLIP tokenizer; texts are padded to its `model_max_length` and cut there, with a warning.
         text_encoder: a `CLIPTextModel`; its last hidden state is the embedding, as in diffusers' pipelines.
         device: where the embeddings go; None: they stay on the encoder's.
+        words: learned words, and the tokens that stand for each.
     """
 
-    def __init__(self, tokenizer: Any, text_encoder: torch.nn.Module, device: torch.device | str | None = None) -> None:
+    def __init__(
+        self,
+        tokenizer: Any,
+        text_encoder: torch.nn.Module,
+        device: torch.device | str | None = None,
+        words: Mapping[str, str] | None = None,
+    ) -> None:
         self.tokenizer = tokenizer
         self.text_encoder = text_encoder
         self.device = device
+        self.words = dict(words or {})
         # A tokenizer saved without its length reports a huge number; the position table is the true limit.
         positions = text_encoder.config.max_position_embeddings
         self.length = min(tokenizer.model_max_length, positions)
@@ -84,10 +92,11 @@ class TextEmbeddings:
 
     def _encode(self, texts: Iterable[str]) -> None:
         for text in texts:
+            written = self._written(text)
             tokens = self.tokenizer(
-                text, padding="max_length", max_length=self.length, truncation=True, return_tensors="pt"
+                written, padding="max_length", max_length=self.length, truncation=True, return_tensors="pt"
             )
-            if len(self.tokenizer(text).input_ids) > self.length:
+            if len(self.tokenizer(written).input_ids) > self.length:
                 logger.warning("the text encoder reads %d tokens; the end of %r is not seen", self.length, text)
             device = next(self.text_encoder.parameters()).device
             # Only encoders that were trained with a mask get one: Stable Diffusion attends to the padding too.
@@ -95,3 +104,9 @@ class TextEmbeddings:
             mask = tokens.attention_mask.to(device) if masked else None
             embedding = self.text_encoder(tokens.input_ids.to(device), attention_mask=mask)[0]
             self._cache[text] = embedding.to(self.device or device)
+
+    def _written(self, text: str) -> str:
+        """The text with all tokens of each learned word."""
+        for word, tokens in self.words.items():
+            text = re.sub(rf"(?<!\w){re.escape(word)}(?!\w)", lambda match, tokens=tokens: tokens, text)
+        return text

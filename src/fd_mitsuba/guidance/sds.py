@@ -16,6 +16,7 @@ from fd_mitsuba.conventions import Weighting
 
 PredictionType = Literal["epsilon", "v_prediction", "sample"]
 Annealing = Literal["linear", "sqrt"]
+_LEAST_LEVEL = 1e-12
 
 
 def _per_latent(values: Tensor) -> Tensor:
@@ -26,7 +27,7 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
     """w(t), which the paper leaves open, for each alpha_bar.
 
     `sds`: 1 - alpha_bar (DreamFusion); `uniform`: 1; `fantasia3d`: sqrt(alpha_bar) (1 - alpha_bar);
-    `inverse`: 1 / (1 - alpha_bar).
+    `inverse`: 1 / (1 - alpha_bar); `ism`: sqrt((1 - alpha_bar) / alpha_bar) (LucidDreamer, arXiv 2311.11284).
     """
     if weighting == "sds":
         return 1 - alpha_bar
@@ -36,6 +37,8 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
         return alpha_bar.sqrt() * (1 - alpha_bar)
     if weighting == "inverse":
         return 1 / (1 - alpha_bar)
+    if weighting == "ism":
+        return ((1 - alpha_bar) / alpha_bar).sqrt()
     raise ValueError(f"unknown weighting {weighting!r}")
 
 
@@ -89,9 +92,24 @@ def noise_from_prediction(prediction: Tensor, z_t: Tensor, alpha_bar: Tensor, ki
 
 
 def clean_estimate(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor) -> Tensor:
-    """z_hat = (z_t - sqrt(1 - alpha_bar) e_hat) / sqrt(alpha_bar): the clean latents that e_hat implies."""
+    """z_hat = (z_t - sqrt(1 - alpha_bar) e_hat) / sqrt(alpha_bar): the clean latents that e_hat implies.
+
+    Near alpha_bar = 0 this is the difference of two numbers that are nearly the same: see `levels`.
+    """
     abar = _per_latent(alpha_bar)
-    return (z_t - (1 - abar).sqrt() * noise_hat) / abar.sqrt().clamp(min=1e-4)
+    return (z_t - (1 - abar).sqrt() * noise_hat) / abar.sqrt().clamp(min=_LEAST_LEVEL**0.5)
+
+
+def levels(alphas_cumprod: Tensor) -> Tensor:
+    """alpha_bar of all timesteps as the formulas here take them: float32, and float64 where one is 0.
+
+    A schedule with zero terminal SNR (arXiv 2305.08891) has alpha_bar = 0 at its last timestep, where e_hat = z_t says
+    nothing of what the network sees. With 1e-12 in its place and 16 digits, `noise_from_prediction` of v and
+    `clean_estimate` give z_hat = -v there, to a millionth.
+    """
+    if bool((alphas_cumprod > 0).all()):
+        return alphas_cumprod.to(torch.float32)
+    return alphas_cumprod.to(torch.float64).clamp(min=_LEAST_LEVEL)
 
 
 def cfg_coefficients(scale: float) -> dict[str, float]:
@@ -122,6 +140,13 @@ def _nonzero(coefficients: dict[str, float]) -> dict[str, float]:
 def combine(predictions: dict[str, Tensor], coefficients: dict[str, float]) -> Tensor:
     """Sum of coefficient times prediction over the passes that `coefficients` names."""
     return sum(value * predictions[name] for name, value in coefficients.items())  # type: ignore[return-value]
+
+
+def perpendicular(other: Tensor, direction: Tensor) -> Tensor:
+    """What of `other` (N, C, H, W) is perpendicular to `direction`, sample by sample: o - (o d / d d) d (Perp-Neg)."""
+    inner = (other * direction).sum(dim=(1, 2, 3), keepdim=True)
+    square = direction.square().sum(dim=(1, 2, 3), keepdim=True)
+    return other - inner / square.clamp(min=torch.finfo(direction.dtype).tiny) * direction
 
 
 def sds_gradient(noise_hat: Tensor, noise: Tensor, weights: Tensor) -> Tensor:

@@ -33,6 +33,14 @@ def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = ""
     )
 
 
+def understood_part_prompt(part: str, prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> PromptReading:
+    """The reading of a part's own prompt; UserError as `understood_prompt`, which names the part."""
+    try:
+        return understood_prompt(prompt, vocabulary, base_prompt)
+    except UserError as error:
+        raise UserError(f"part {part!r}: {error}") from None
+
+
 def cuts_are_unknown(scene: Path) -> UserError:
     """Why a model that lists its words cannot guide regions that subtract."""
     return UserError(

@@ -6,7 +6,7 @@ Symbols as in `sds`; g is the gradient with respect to z, z_hat the clean latent
 that the network sees with the prompt, e(free) that without: with the negative prompt, and for a network that sees the
 base with the base's picture. e_hat is classifier-free guidance of the two (`sds.cfg_coefficients`).
 
-The network itself, a `Network`, may predict e, v or z and take 4 or 8 channels; no variant knows which.
+The network itself, a `Network`, may predict e, v or z and take 4, 8 or 9 channels; no variant knows which.
 """
 
 from __future__ import annotations
@@ -60,13 +60,32 @@ class Distillation:
     guidance_scale: float
     image_guidance_scale: float
     timestep_range: tuple[float, float]
+    perp_neg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Area:
+    """A place in the pictures with texts of its own.
+
+    Attributes:
+        mask: (n, 1, L, L) in [0, 1]; of all areas together at most 1.
+        texts: pass -> (n, length, width), of the passes whose text differs from the chunk's.
+    """
+
+    mask: Tensor
+    texts: dict[str, Tensor]
+
+    def rows(self, rows: slice) -> Area:
+        """The area in some of the pictures."""
+        return Area(self.mask[rows], {name: text[rows] for name, text in self.texts.items()})
 
 
 @dataclass(frozen=True)
 class Chunk:
     """What the network needs for some pictures: all (n, ...), on its device, without gradients.
 
-    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere.
+    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere. `areas` have texts of
+    their own: there the network's noise is what it sees with these. `control` (n, 3, H, H) is for a ControlNet.
     """
 
     z: Tensor
@@ -75,16 +94,23 @@ class Chunk:
     texts: dict[str, Tensor]
     condition: Tensor | None
     mask: Tensor | None
+    areas: tuple[Area, ...] = ()
+    control: Tensor | None = None
 
 
 class Network(Protocol):
     """What the variants ask of `denoiser.Denoiser`."""
 
-    needs_base: bool
+    has_image_pass: bool
     alpha_bars: Tensor
 
     def predict_noise(
-        self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], condition: Tensor | None
+        self,
+        z_t: Tensor,
+        timesteps: Tensor,
+        texts: dict[str, Tensor],
+        condition: Tensor | None,
+        control: Tensor | None = None,
     ) -> dict[str, Tensor]: ...
 
 
@@ -98,7 +124,7 @@ class Query:
 
     @property
     def free(self) -> str:
-        return free_pass(self.network.needs_base)
+        return free_pass(self.network.has_image_pass)
 
     @property
     def noise(self) -> Tensor:
@@ -117,16 +143,35 @@ class Query:
         return sds.add_noise(self.chunk.z, self.noise, self.alpha_bar(timesteps))
 
     def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
-        """Noise of each named pass."""
+        """Noise of each named pass: e + sum over areas of mask (e(area's text) - e)."""
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
         if missing := set(names) - set(texts):
             raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
-        return self.network.predict_noise(z_t, timesteps, texts, self.chunk.condition)
+        known = self.chunk.condition, self.chunk.control
+        seen = self.network.predict_noise(z_t, timesteps, texts, *known)
+        merged = dict(seen)
+        for area in self.chunk.areas:
+            own = {name: area.texts[name] for name in texts if name in area.texts}
+            if not own:
+                continue
+            for name, noise in self.network.predict_noise(z_t, timesteps, own, *known).items():
+                merged[name] = merged[name] + area.mask * (noise - seen[name])
+        return merged
 
     def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
-        """e_hat: classifier-free guidance."""
-        coefficients = guidance_coefficients(self.how, self.network.needs_base)
-        return sds.combine(self.passes(z_t, timesteps, coefficients), coefficients)
+        """e_hat: classifier-free guidance; with `perp_neg` less scale perp_neg perp(e(negative) - e(free)).
+
+        perp: what is perpendicular to e(text) - e(free), which read no negative prompt then (arXiv 2304.04968).
+        """
+        how, with_image = self.how, self.network.has_image_pass
+        coefficients = guidance_coefficients(how, with_image)
+        seen = self.passes(z_t, timesteps, _guided_passes(how, with_image))
+        noise_hat = sds.combine(seen, coefficients)
+        if how.perp_neg == 0:
+            return noise_hat
+        free = seen[self.free]
+        away = sds.perpendicular(seen["negative"] - free, seen["text"] - free)
+        return noise_hat - how.guidance_scale * how.perp_neg * away
 
     def move(self, z_t: Tensor, noise_hat: Tensor, now: Tensor, to: Tensor) -> Tensor:
         """A DDIM step to the levels `to`, up or down. Outside the mask z stays what it is, without noise."""
@@ -233,19 +278,28 @@ class Reconstruction(Variant):
         return sds.reconstruction_gradient(query.chunk.z, z_hat, query.weights()), z_hat
 
 
-def free_pass(needs_base: bool) -> str:
-    """Name of the pass without the prompt: a network that sees the base still sees it there."""
-    return "image" if needs_base else "plain"
+def free_pass(has_image_pass: bool) -> str:
+    """Name of the pass without the prompt: a network that is guided by the base's image, too, still sees it there."""
+    return "image" if has_image_pass else "plain"
 
 
-def guidance_coefficients(how: Distillation, needs_base: bool) -> dict[str, float]:
+def guidance_coefficients(how: Distillation, has_image_pass: bool) -> dict[str, float]:
     """The passes of classifier-free guidance with their coefficients."""
-    if needs_base:
+    if has_image_pass:
         return sds.cfg_coefficients_with_image(how.guidance_scale, how.image_guidance_scale)
     return sds.cfg_coefficients(how.guidance_scale)
 
 
-def passes_of(how: Distillation, needs_base: bool) -> tuple[str, ...]:
+def _guided_passes(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
+    """Names of the passes that `Query.guided` asks for."""
+    names = tuple(guidance_coefficients(how, has_image_pass))
+    if how.perp_neg == 0:
+        return names
+    return tuple(dict.fromkeys((*names, "text", "negative", free_pass(has_image_pass))))
+
+
+def passes_of(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
     """Names of all passes that the variant asks for; a pass without weight is left out."""
-    names = {"guided": guidance_coefficients(how, needs_base), "text": ("text",), "free": (free_pass(needs_base),)}
+    free = (free_pass(has_image_pass),)
+    names = {"guided": _guided_passes(how, has_image_pass), "text": ("text",), "free": free}
     return tuple(dict.fromkeys(name for asked in how.variant.passes for name in names[asked]))

@@ -207,8 +207,7 @@ def _film_points(cameras: FilmCameras, spp: int, seed: int) -> tuple[mi.Point2f,
 
 
 def _some(cameras: CameraBatch, begin: int, end: int) -> CameraBatch:
-    names = ("position", "target", "fov_deg", "azimuth_deg", "elevation_deg")
-    return CameraBatch(**{name: getattr(cameras, name)[begin:end] for name in names})
+    return cameras.some(slice(begin, end))
 
 
 def _join(picture: list[mi.Float]) -> mi.Float:

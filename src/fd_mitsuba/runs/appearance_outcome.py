@@ -24,7 +24,7 @@ from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.runs.cost_memory import refuse_too_many_samples
-from fd_mitsuba.runs.geometry_outcome import with_prompt
+from fd_mitsuba.runs.geometry_outcome import texts_of_parts, with_prompt
 from fd_mitsuba.runs.preservation import measure_preservation
 from fd_mitsuba.runs.saved_run import saved_run
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
@@ -133,8 +133,20 @@ def prepare_appearance(
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
     check_views(AppearanceStage.name, config, guidance)
-    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt, scene.base_prompt)
+    texts = texts_of_parts(scene)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say_of_prompt, scene.base_prompt, texts)
     return guidance
+
+
+def cuts_stay_plain(scene: EditScene, config: RunConfig, given: object = None) -> bool:
+    """Whether the appearance stage is left out, because the built-in prior would guide it and knows no cuts.
+
+    Args:
+        given: a caller's own guidance.
+    """
+    diffusion = config.guidance.kind.kind == "diffusion"
+    by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(given, "guide_appearance")
+    return scene.subtracts and config.appearance.lambda_sds > 0 and by_builtin
 
 
 def _own_guidance(config: RunConfig, shared: Guidance | None, given: Guidance | None) -> AppearanceGuidance | None:

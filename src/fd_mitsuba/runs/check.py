@@ -13,7 +13,7 @@ from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError, printable
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading
-from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_prompt
+from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_part_prompt, understood_prompt
 from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import CostEstimate, estimate_cost
@@ -79,6 +79,8 @@ class CheckReport:
     warnings: tuple[str, ...]
     prompt_reading: PromptReading | None = None
     """What the guidance model understands of the prompt; None where it takes any text, or where no model is asked."""
+    part_readings: dict[str, PromptReading] = dataclasses.field(default_factory=dict)
+    """The same of the prompts that parts have of their own."""
     refusal: str | None = None
     """Why a run with these settings would end before its first step; None: it would not."""
 
@@ -92,6 +94,9 @@ class CheckReport:
         if self.prompt_reading is not None:
             lines.append(f"read as  {self.prompt_reading.summary()}")
             lines.append(f"         the prior is told {self.prompt_reading.caption!r}")
+        for part, reading in self.part_readings.items():
+            lines.append(f"prompt   of part {part}, read as {reading.summary()}")
+            lines.append(f"         the prior is told {reading.caption!r}")
         for mesh in self.base:
             found = mesh.topology
             state = _closedness(found)
@@ -130,7 +135,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
     """
     config = checked_choices(config)
     refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
-    reading, refusal = _prompt(scene, config)
+    reading, part_readings, refusal = _prompts(scene, config)
     base = tuple(
         BaseCheck(mesh.name, len(mesh.vertices), len(mesh.faces), mesh.volume(), topology(mesh.vertices, mesh.faces))
         for mesh in scene.base
@@ -162,15 +167,16 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
             + ([cost.memory_warning] if cost.memory_warning else [])
         ),
         prompt_reading=reading,
+        part_readings=part_readings,
         refusal=refusal,
     )
 
 
-def _prompt(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, str | None]:
-    """How the guidance models read the scene's prompt, and why they would refuse it."""
+def _prompts(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, dict[str, PromptReading], str | None]:
+    """How the guidance models read the scene's prompt and those of parts, and why they would refuse them."""
     by_words = config.appearance.lambda_sds > 0 and scene.has_light and not scene.subtracts
     asked = {False: config.geometry.lambda_sds > 0, True: by_words}
-    reading = None
+    reading, parts = None, {}
     try:
         for appearance in (stage for stage, wanted in asked.items() if wanted):
             if (vocabulary := vocabulary_of(config.guidance.model, appearance)) is None:
@@ -179,9 +185,11 @@ def _prompt(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, 
                 raise cuts_are_unknown(scene.path)
             found = understood_prompt(scene.prompt, vocabulary, scene.base_prompt)
             reading = reading or found
+            for part, own in scene.part_prompts.items():
+                parts.setdefault(part, understood_part_prompt(part, own.prompt, vocabulary, scene.base_prompt))
     except UserError as error:
-        return reading, str(error)
-    return reading, None
+        return reading, parts, str(error)
+    return reading, parts, None
 
 
 def _closedness(found: Topology) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.backend.threads import cores_in_use
-from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
@@ -21,10 +21,8 @@ START_AND_EXPORT_SECONDS = 15.0
 LIT_PICTURES_SECONDS = 45.0
 """What the appearance stage takes besides its steps: kernels, lit turntable, baked textures."""
 
-_OPERATIONS = 3e10
-"""Floating-point operations a second of a core on the networks of Stable Diffusion."""
-_OPERATIONS_ELSEWHERE = 3e13
-"""The same of a graphics card, roughly: they differ by more than a factor of ten."""
+_OPERATIONS_ELSEWHERE = {"float32": 3e13, "bfloat16": 6e13, "float16": 6e13}
+"""Floating-point operations a second of a graphics card that is not here: they differ by a factor of ten and more."""
 _MOST_CORES_OF_USE = 16
 
 _SECONDS_PER_MILLION_FACES = 20.0
@@ -82,20 +80,21 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
     refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
     weights, source = unet_weights(guidance.model)
+    guided = geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
+    speed = None if builtin or not guided else _speed(guidance)
     passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
-    if builtin:
+    if speed is None:
         forward = encoder = 0.1 / 4 * 2 / cores  # four views are one picture to it; measured with two cores
     else:
         # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
-        rate = _OPERATIONS * cores if guidance.device == "cpu" else _OPERATIONS_ELSEWHERE
-        forward, encoder = 800.0 * weights / rate, 2.2e12 / rate
+        forward, encoder = 800.0 * weights / speed.unet, 2.2e12 / speed.vae
     image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
     step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
     size = SceneSize.of(scene)
     more_faces, more_light = size.faces / 1e6, size.light_pixels / 1e6
     assumptions = (
-        f"{cores} cores of about 30 GFLOP/s each, otherwise idle, and views at the size of the latent",
-        *([] if guidance.device == "cpu" else [f"networks on {guidance.device}, at about 30 TFLOP/s"]),
+        f"{cores} cores, otherwise idle, and views at the size of the latent",
+        *([] if speed is None else [speed.text]),
         f"a base of {size.faces} faces, light of {more_light:.3g} million pixels",
         f"a UNet of {weights / 1e6:.3g} million weights ({source})",
         f"{queries} queries of the part's field a step",
@@ -118,6 +117,32 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     return CostEstimate(
         active, share, step, total, shape_memory, lit, lit_total, sum(terms.values()), warning, assumptions
     )
+
+
+@dataclass(frozen=True)
+class _Speed:
+    """Floating-point operations a second of the UNet and of the VAE, and how they are known."""
+
+    unet: float
+    vae: float
+    text: str
+
+
+def _speed(guidance: GuidanceConfig) -> _Speed:
+    """Measured where the device is there; the VAE is always float32."""
+    from fd_mitsuba.guidance.speed import measured_speed
+
+    device, dtype = guidance.device, guidance.dtype
+    unet = measured_speed(device, dtype)
+    vae = unet if dtype == "float32" else measured_speed(device, "float32")
+    how = "as measured just now"
+    if unet is None or vae is None:
+        unet, vae = _OPERATIONS_ELSEWHERE[dtype], _OPERATIONS_ELSEWHERE["float32"]
+        how = f"as of a usual card: torch finds no {device} here"
+    rates = " and ".join(
+        dict.fromkeys(f"{rate / 1e12:.3g} TFLOP/s in {kind}" for rate, kind in ((unet, dtype), (vae, "float32")))
+    )
+    return _Speed(unet, vae, f"networks on {device} at {rates}, {how}")
 
 
 def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float:

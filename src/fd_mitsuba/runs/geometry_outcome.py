@@ -58,16 +58,33 @@ def prepare_geometry(
         return with_prompt(guidance, scene, say)
     if guidance.conventions.vocabulary is not None and scene.subtracts:
         raise cuts_are_unknown(scene.path)
-    take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt, texts_of_parts(scene))
     return guidance
 
 
 def with_prompt(given: Guidance | AppearanceGuidance, scene: EditScene, say: Callable[[str], None]) -> Any:
-    """A caller's own guidance with the scene's prompts; the words that it does not know are logged."""
+    """A caller's own guidance with the scene's prompts; the words that it does not know are logged.
+
+    Raises:
+        UserError: focal regions have prompts, and the guidance takes none of parts.
+    """
+    texts = texts_of_parts(scene)
+    if texts and not hasattr(given, "set_part_prompts"):
+        raise UserError(
+            f"{scene.path}: part {next(iter(texts))!r} has a prompt of its own, which {type(given).__name__} cannot "
+            "take; remove the prompts of the focal regions, or give the guidance set_part_prompts"
+        )
     unknown = given.set_prompt(scene.prompt, scene.negative_prompt)
+    if texts:
+        given.set_part_prompts(texts)
     if unknown:
         say(f"{type(given).__name__} does not know {', '.join(map(repr, unknown))}")
     return given
+
+
+def texts_of_parts(scene: EditScene) -> dict[str, tuple[str, str]]:
+    """Part -> prompt and negative prompt, of the parts that have their own, as guidances take them."""
+    return {part: (own.prompt, own.negative_prompt) for part, own in scene.part_prompts.items()}
 
 
 def refuse_other_shape(before: EditScene, now: EditScene, source: Path) -> None:

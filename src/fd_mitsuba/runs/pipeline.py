@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from fd_mitsuba.backend.peak_memory import peak_memory_mb
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
@@ -23,6 +24,7 @@ from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.appearance_outcome import (
     CUTS_UNKNOWN,
+    cuts_stay_plain,
     finished_appearance,
     opened_base,
     parts_of_run,
@@ -32,6 +34,7 @@ from fd_mitsuba.runs.appearance_outcome import (
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import unet_weights
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
+from fd_mitsuba.runs.follower import refuse_guidance_alone
 from fd_mitsuba.runs.geometry_outcome import (
     cut_out,
     export_geometry,
@@ -111,10 +114,10 @@ def run(
         started = time.monotonic()
         config = checked_choices(config)
         refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
+        if guidance is not None:
+            refuse_guidance_alone(guidance)
         asked, with_assets = stages, "appearance" in stages
-        diffusion = config.guidance.kind.kind == "diffusion"
-        by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(guidance, "guide_appearance")
-        if scene.subtracts and with_assets and config.appearance.lambda_sds > 0 and by_builtin:
+        if with_assets and cuts_stay_plain(scene, config, guidance):
             if "geometry" not in stages:
                 raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
             say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
@@ -133,6 +136,9 @@ def run(
             listener = (lambda line: None) if for_geometry is not None else say
             loaded = for_geometry if guidance is None else None
             for_appearance = prepare_appearance(scene, config, say, listener, loaded, guidance)
+
+        for own in (for_geometry, for_appearance):
+            refuse_guidance_alone(own)
 
         def begin() -> None:
             for line in (*opening, *scene.warnings):
@@ -171,6 +177,7 @@ def run(
             write_json(folder / "metrics.json", metrics)
 
         write_metrics()
+        processes().wait()  # the parts are there for the others
         field = None
         if "appearance" in stages:
             appearance = AppearanceStage(

@@ -19,7 +19,7 @@ from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.file_gate import mark_sound
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
-from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
+from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion, PartPrompt
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, BrokenMesh, NotAMesh, shape_triangles
@@ -29,6 +29,7 @@ from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
 from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
+from fd_mitsuba.scene.region_prompt import check_prompts, part_prompts, region_prompt
 from fd_mitsuba.scene.region_shapes import ELLIPSOID
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
@@ -80,6 +81,11 @@ class EditScene:
         """Part name -> its regions, in the order of the scene file."""
         names = dict.fromkeys(region.part for region in self.regions)
         return {name: tuple(region for region in self.regions if region.part == name) for name in names}
+
+    @property
+    def part_prompts(self) -> dict[str, PartPrompt]:
+        """Part name -> its own prompt, of the parts that have one."""
+        return part_prompts(self.regions)
 
     @property
     def subtracts(self) -> bool:
@@ -175,6 +181,7 @@ def load_edit_scene(
                 raise error
             on_misplaced(error)
     check_modes([element for _, element in elements], found, base, frame)
+    check_prompts([element for _, element in elements], found)
     for source in inputs.sources:
         refuse_broken_parameters(source, source.instantiate())
     folder = file.path.parent
@@ -313,7 +320,7 @@ def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame
     if filename or element.properties.get("shape", ELLIPSOID) != ELLIPSOID:
         sources = (file.resolve(filename),) if filename else ()
         mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, sources)
-    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element))
+    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element), region_prompt(element))
     if not region.volume > 0:
         raise element.error("the region has no volume; enlarge it")
     if mesh is not None and not region.has_inside():

@@ -19,6 +19,19 @@ _SURFACE_POINTS = 4096
 
 
 @dataclass(frozen=True)
+class PartPrompt:
+    """What one part shall be.
+
+    Attributes:
+        prompt: never blank.
+        negative_prompt: what to keep away from; "": what the scene says.
+    """
+
+    prompt: str
+    negative_prompt: str = ""
+
+
+@dataclass(frozen=True)
 class FocalRegion:
     """One region Omega'; the union of a part's regions is where that part starts and stays.
 
@@ -30,6 +43,7 @@ class FocalRegion:
         part: name of the editable part that it belongs to.
         mesh: None for an ellipsoid, else the closed mesh, vertices in the canonical frame.
         mode: `ADD` or `SUBTRACT`.
+        prompt: of its own; None: that of its part, or the scene's.
     """
 
     name: str
@@ -37,6 +51,7 @@ class FocalRegion:
     part: str = DEFAULT_PART_NAME
     mesh: TriangleMesh | None = None
     mode: str = ADD
+    prompt: PartPrompt | None = None
 
     def __post_init__(self) -> None:
         matrix = np.array(self.to_canonical, dtype=np.float64)

@@ -78,7 +78,18 @@ def region_choice(properties: Mapping[str, Any]) -> Choice | None:
     return None if is_file else choice
 
 
-_OWN = ("part", "mode", "filename", "shape", "to_world", "face_normals", "flip_normals", "silent")
+_OWN = (
+    "part",
+    "mode",
+    "prompt",
+    "negative_prompt",
+    "filename",
+    "shape",
+    "to_world",
+    "face_normals",
+    "flip_normals",
+    "silent",
+)
 """Properties of a region that are none of its shape's: ours, and those that Mitsuba gives every shape."""
 
 

@@ -59,6 +59,11 @@ class CameraBatch:
     def __len__(self) -> int:
         return len(self.fov_deg)
 
+    def some(self, chosen: slice) -> CameraBatch:
+        """Some of the cameras, in their order."""
+        names = ("position", "target", "fov_deg", "azimuth_deg", "elevation_deg")
+        return CameraBatch(**{name: getattr(self, name)[chosen] for name in names})
+
     def basis(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The cameras' unit axes right, up, back: (B, 3) float32 each, right-handed (right x up = back).
 

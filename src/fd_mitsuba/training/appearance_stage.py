@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
@@ -24,6 +25,7 @@ from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.part_shading import PartShading
+from fd_mitsuba.render.surface_views import surface_views
 from fd_mitsuba.render.tonemap import CLAY_LEVEL, auto_exposure, to_linear, to_srgb
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
@@ -31,6 +33,7 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
 from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
@@ -92,6 +95,7 @@ class AppearanceStage:
         self.exposure = settings.exposure or self._exposure()
         self._points = points_on(self.parts.values(), _POOL, seed_for(config.seed, Purpose.STYLE))
         self.losses = self._losses(say)
+        self._region_masks = RegionMasks(scene, config, guidance)
 
     def phase_name(self, step: int) -> str:
         """The name that the progress line shows."""
@@ -121,7 +125,9 @@ class AppearanceStage:
         """
         settings = self.config.appearance
         cameras, closeup = self.cameras(step)
-        seed = seed_for(self.config.seed, Purpose.APPEARANCE_PIXELS, step)
+        share = processes().share(len(cameras))
+        cameras = cameras.some(share)
+        seed = seed_for(self.config.seed, Purpose.APPEARANCE_PIXELS, step) + share.start
         gbuffer = self.rendering.trace(cameras, seed)
         texture = self.texture(gbuffer)
         losses: dict[str, Tensor] = {}
@@ -138,11 +144,15 @@ class AppearanceStage:
                 azimuth_deg=cameras.azimuth_deg,
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
+                regions=self._region_masks(cameras, step, share.start),
+                share=share,
+                control=self._control(gbuffer),
             )
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
             result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
             losses["sds"], preview = result.loss, result.preview
             values.update(result.logs)
+        values = processes().values_of_all(values)
         losses.update(self.losses(texture, gbuffer, self.field, step))
         weights = {"sds": settings.lambda_sds, **self.losses.weights}
         values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
@@ -186,10 +196,17 @@ class AppearanceStage:
             return self.rendering.render_light(gbuffer)
         if kind == "random":
             generator = torch.Generator().manual_seed(seed_for(self.config.seed, Purpose.BACKGROUND, step))
-            colour = to_linear(torch.rand(gbuffer.views.count, 3, 1, 1, generator=generator))
+            count = self.config.appearance.views
+            colours = torch.rand(count, 3, 1, 1, generator=generator)[processes().share(count)]
+            colour = to_linear(colours)
         else:
             colour = torch.full((1, 3, 1, 1), 0.0 if kind == "black" else 1.0)
         return colour / self.exposure
+
+    def _control(self, gbuffer: GBuffer) -> Tensor | None:
+        """What the guidance's ControlNet, if it has one, is shown of the surface."""
+        kind = getattr(self.guidance, "control_sees", None)
+        return None if kind is None else surface_views(gbuffer, kind)
 
     @torch.no_grad()
     def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:

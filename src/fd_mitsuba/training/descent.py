@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.backend.processes import Processes, processes
 from fd_mitsuba.config.sections import AppearanceConfig, GeometryConfig
 from fd_mitsuba.errors import RunStopped
 
@@ -38,17 +39,33 @@ def descend(
     Raises:
         RunStopped: a loss or a gradient is not finite; the message ends with `remedy`.
     """
+    group = processes()
     total = sum(weights[name] * loss for name, loss in losses.items())
     values = {f"loss_{name}": float(loss.detach()) for name, loss in losses.items()}
     values["loss"] = float(total.detach()) if isinstance(total, Tensor) else 0.0
+    if group.count > 1:
+        # The guidance's loss is of the process's own views, all others are the same in every process.
+        total = sum(weights[name] * loss / (1 if name == "sds" else group.count) for name, loss in losses.items())
+        values = group.values_of_all(values)
+        values["loss"] = sum(weights[name] * values[f"loss_{name}"] for name in losses)
     if not np.isfinite(values["loss"]):
         raise RunStopped(f"step {step}: the loss is not finite; {remedy}")
     if isinstance(total, Tensor) and total.requires_grad:
         optimiser.zero_grad(set_to_none=True)
         total.backward()
-        for group in optimiser.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                    raise RunStopped(f"step {step}: a gradient is not finite; {remedy}")
+        parameters = [parameter for part in optimiser.param_groups for parameter in part["params"]]
+        _add_up_gradients(group, parameters)
+        for parameter in parameters:
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                raise RunStopped(f"step {step}: a gradient is not finite; {remedy}")
         optimiser.step()
     return values
+
+
+def _add_up_gradients(group: Processes, parameters: list[Tensor]) -> None:
+    if group.count == 1:
+        return
+    for parameter in parameters:
+        if parameter.grad is None:  # another process's views may have one
+            parameter.grad = torch.zeros_like(parameter)
+    group.add_up(parameter.grad for parameter in parameters if parameter.grad is not None)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.active_vertices import active_vertices
@@ -29,6 +30,7 @@ from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
 from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
+from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
@@ -85,6 +87,7 @@ class GeometryStage:
         self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
         self._base_passes: dict[Phase, GeometryPass] = {}
+        self._region_masks = RegionMasks(scene, config, guidance)
         self.counters = {"invisible_steps": 0}
         """Whole numbers that steps hand on to later ones; a checkpoint keeps them."""
 
@@ -143,13 +146,17 @@ class GeometryStage:
         values: dict[str, float] = {}
         pictures, preview = torch.zeros(0), None
         if self.guidance is not None and geometry.lambda_sds > 0:
-            pictures = self._render(surface, cameras, phase, step)
-            base = self._render_base(cameras, phase, step) if self.guidance.needs_base else None
-            views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup)
+            share = processes().share(len(cameras))
+            cameras = cameras.some(share)
+            pictures = self._render(surface, cameras, phase, step, share.start)
+            base = self._render_base(cameras, phase, step, share.start) if self.guidance.needs_base else None
+            regions = self._region_masks(cameras, step, share.start)
+            sides = cameras.azimuth_deg, cameras.elevation_deg
+            views = GuidanceViews(pictures, base, *sides, closeup, regions, share)
             seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
             result = self.guidance.guide(views, phase_step, phase_length, phase, seed)
             losses["sds"], preview = result.loss, result.preview
-            values.update(result.logs)
+            values.update(processes().values_of_all(result.logs))
             self._watch_visibility(pictures)
         if samples is not None:
             losses.update(self.field_losses(surface.sample_sdf, samples, step))
@@ -179,25 +186,25 @@ class GeometryStage:
             )
         return {"volume_ratio": inside}
 
-    def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
+    def _render(self, surface: UnionSurface, cameras: CameraBatch, phase: Phase, step: int, first: int) -> Tensor:
         return self._pass(self._passes, phase).render(
             surface.vertices,
             surface.faces,
             surface.part_weight,
             cameras,
-            seed_for(self.config.seed, Purpose.PIXELS, step),
+            seed_for(self.config.seed, Purpose.PIXELS, step) + first,
             static_faces=self.extractor.static_faces,
             static_vertices=self.extractor.static_vertices,
         )
 
-    def _render_base(self, cameras: CameraBatch, phase: Phase, step: int) -> Tensor:
+    def _render_base(self, cameras: CameraBatch, phase: Phase, step: int, first: int) -> Tensor:
         base = self.base_surface
         return self._pass(self._base_passes, phase).render_primal(
             base.vertices,
             base.faces,
             base.part_weight,
             cameras,
-            seed_for(self.config.seed, Purpose.BASE_PIXELS, step),
+            seed_for(self.config.seed, Purpose.BASE_PIXELS, step) + first,
             static_faces=len(base.faces),
         )
 
@@ -234,7 +241,7 @@ class GeometryStage:
             return alone(PartField(self.config.field))
 
     def _watch_visibility(self, pictures: Tensor) -> None:
-        visible = float(pictures[:, 4].detach().sum()) >= 0.5
+        visible = processes().sum(float(pictures[:, 4].detach().sum())) >= 0.5
         self.counters["invisible_steps"] = 0 if visible else self.counters["invisible_steps"] + 1
         if self.counters["invisible_steps"] >= VANISHED_AFTER:
             raise RunStopped(

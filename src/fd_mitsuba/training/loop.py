@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
-from fd_mitsuba.errors import Interrupted
+from fd_mitsuba.backend.processes import Processes, processes
+from fd_mitsuba.errors import Interrupted, RunStopped, out_of_memory
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, load_newest, save_checkpoint
 from fd_mitsuba.training.record import Recorder
 from fd_mitsuba.training.stage import OnStep, Stage, StepUpdate
@@ -48,17 +51,28 @@ def run_stage(
         header = CheckpointHeader(stage.name, step, config_hash, counters=dict(stage.counters))
         save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept)
 
-    with stop_on_signals() as request, Recorder(folder, stage.name, total, done, quiet) as recorder:
+    group = processes()
+    recording = Recorder(folder, stage.name, total, done, quiet) if group.writes else nullcontext()
+    with stop_on_signals() as request, recording as recorder:
         for step in range(done, total):
-            record = stage.step(step)
+            try:
+                record = stage.step(step)
+            except (MemoryError, RuntimeError) as error:  # torch, Dr.Jit and CUDA say it in words only
+                if problem := out_of_memory(error):
+                    raise RunStopped(f"step {step + 1}: {problem}") from None
+                raise
             finished = step + 1
             last = finished == total
-            stopped_by = request.name  # read once: a signal after this line stops the next step
+            stopped_by = _agreed(group, request.name)  # read once: a signal after this line stops the next step
             saving = finished % config.output.checkpoint_every == 0 or last or stopped_by is not None
             values = dict(record.values)
             if saving or finished % _FIELD_CHECKED_EVERY == 0:
                 values.update(stage.check_field(finished))
             phase = stage.phase_name(step)
+            if recorder is None:
+                if stopped_by is not None:
+                    raise Interrupted(f"{stopped_by}: stopped after step {finished} of {total}")
+                continue
             recorder.row(finished, phase, values)
             every = config.output.sheet_every
             if every and (finished % every == 0 or last) and (sheet := record.sheet()) is not None:
@@ -69,3 +83,11 @@ def run_stage(
                 on_step(StepUpdate(stage.name, phase, finished, total, values, stage))
             if stopped_by is not None:
                 raise Interrupted(f"{stopped_by}: stopped after step {finished} of {total}; continue with --resume")
+
+
+def _agreed(group: Processes, name: str | None) -> str | None:
+    """The signal that any process was stopped by, so that all stop after the same step."""
+    if group.count == 1:
+        return name
+    number = group.agree(0 if name is None else int(signal.Signals[name]))
+    return signal.Signals(number).name if number else None

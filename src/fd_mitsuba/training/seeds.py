@@ -27,6 +27,7 @@ class Purpose(IntEnum):
     STYLE_JITTER = 14
     START = 15
     LOSSES = 16
+    REGIONS = 17
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:

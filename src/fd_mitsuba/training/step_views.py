@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.config import CamerasConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.views import CameraBatch, sample_views
@@ -24,7 +25,12 @@ def views_at_once(guidance: SeesMosaics | None) -> int:
 
 def check_views(stage: str, config: RunConfig, guidance: SeesMosaics | None) -> None:
     """UserError where a stage's views do not fill the guidance's mosaics."""
-    views, mosaic = getattr(config, stage).views, views_at_once(guidance)
+    views, mosaic, count = getattr(config, stage).views, views_at_once(guidance), processes().count
+    if count > 1 and views % (mosaic * count):
+        raise UserError(
+            f"{stage}.views = {views}: {count} processes share them, and {config.guidance.source} sees {mosaic} at "
+            f"once; set {stage}.views to a multiple of {mosaic * count}, or start fewer processes"
+        )
     if views % mosaic:
         raise UserError(
             f"{stage}.views = {views}: {config.guidance.source} sees {mosaic} views at once; "
