@@ -86,7 +86,6 @@ def test_open_base_and_doubled_faces_are_told(
         (ball("0.03", 0, 0.3, 0), "cells thin"),
         (ball("0.1", 0, 0.45, 0), "gap"),
         (ball("0.1", 0, 0.175, 0), "inside the base"),
-        (ball("0.25", 0, 0.5, 0), "outside the grid"),
     ],
 )
 def test_regions_are_judged(make_scene: Make, region: str, words: str) -> None:

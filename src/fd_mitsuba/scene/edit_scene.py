@@ -20,6 +20,7 @@ from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.file_gate import mark_sound
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion
+from fd_mitsuba.scene.headroom import frame_with_headroom
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, BrokenMesh, NotAMesh, shape_triangles
@@ -85,6 +86,13 @@ class EditScene:
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
         return self.regions[0].mode == SUBTRACT
+
+    @cached_property
+    def has_headroom(self) -> bool:
+        """Whether the canonical frame is another than the paper's, so that it holds the regions."""
+        soup = self.base_soup
+        paper = Normalisation.of_points(soup.vertices[np.unique(soup.faces)])
+        return paper.scale != self.frame.scale or not np.array_equal(paper.centre, self.frame.centre)
 
     @cached_property
     def origin(self) -> np.ndarray:
@@ -165,7 +173,12 @@ def load_edit_scene(
     found = tuple(
         _region(owner, element, index, names[index], frame) for index, (owner, element) in enumerate(elements)
     )
-    soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
+    soup = _soup(base)
+    roomy = frame_with_headroom(frame, soup.vertices[np.unique(soup.faces)], found)
+    if roomy is not frame:
+        found = tuple(region.seen_from(roomy.matrix() @ np.linalg.inv(frame.matrix())) for region in found)
+        frame = roomy
+    soup = TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
