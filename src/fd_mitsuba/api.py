@@ -10,7 +10,10 @@ Example:
 
 from __future__ import annotations
 
+import atexit
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,6 +103,9 @@ def load_scene(
     variant: str = DEFAULT_VARIANT,
     on_misplaced: Callable[[UserError], None] | None = None,
     plugins: Collection[str] = (),
+    at: Sequence[str] = (),
+    size: str | None = None,
+    needs_region: bool = True,
 ) -> EditScene:
     """Read a scene and start Mitsuba if it has not been started.
 
@@ -114,6 +120,11 @@ def load_scene(
         variant: Mitsuba's.
         on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
         plugins: modules or .py files to import first, which register what the scene names; see docs/extending.md.
+        at: places of focal regions that take the place of the scene's own, such as "head"; see
+            `scene.region_words`. The file of regions that is made of them lies in a temporary folder and is copied
+            into the run.
+        size: of these regions: a share of the base's longest side such as "0.3", or "12u" in the scene's unit.
+        needs_region: False: a scene without regions or prompt is taken as well, to look at its base.
 
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
@@ -129,7 +140,31 @@ def load_scene(
     load_plugins(plugins)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced)
+    if at:
+        regions = _placed(Path(path), dict(parameters or {}), regions, at, size)
+    elif size is not None:
+        raise UserError(f"size {size}: is that of regions to place; say where they go, too")
+    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced, needs_region)
+
+
+def _placed(
+    scene: Path, parameters: dict[str, str], regions: Path | str | None, at: Sequence[str], size: str | None
+) -> Path:
+    """A file of regions at places, which is gone with this process."""
+    from fd_mitsuba.assets.placing import write_placed_regions
+
+    if regions is not None:
+        raise UserError(f"{regions}: regions come from a file or from places to put them; give one of the two")
+    target = temporary_folder() / "regions.xml"
+    write_placed_regions(scene, parameters, at, size, target)
+    return target
+
+
+def temporary_folder() -> Path:
+    """A new folder that goes when this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="fd_mitsuba_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def edit(

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.assets.orientation import find_orientation, read_axis
+from fd_mitsuba.assets.placing import placed_regions
 from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.assets.scene_writer import SceneText, write_scene
 from fd_mitsuba.assets.shapes import SceneShape, scene_shapes
@@ -17,7 +18,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import size_problem
 from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.normalisation import Normalisation
-from fd_mitsuba.scene.region_words import ObjectPlaces, region_size
+from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 UNITS = ("mm", "cm", "m")
@@ -92,11 +93,7 @@ def import_file(
     )
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
-    extent = region_size(size, places.longest_side)
-    found = [places.find(word) for word in (at or ("head",))]
-    names = [f"{place.name}_{number}" if [p.name for p in found].count(place.name) > 1 else place.name
-             for number, place in enumerate(found, 1)]  # fmt: skip
-    regions = [places.region(place, extent, name) for place, name in zip(found, names, strict=True)]
+    regions, about = placed_regions(places, at or ("head",), size)
     words = _words(path)
     text = SceneText(
         prompt=prompt or words,
@@ -109,15 +106,18 @@ def import_file(
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
     if not at:
-        remarks.append("puts the region on its head; --at top, back, 'left side', x,y,z and the like put it elsewhere")
+        remarks.append("puts the region on its head; --at says otherwise: top, back, 'left side', x,y,z and the like")
     if prompt is None:
         remarks.append(f"calls it {text.prompt!r}; give the prompt of a run with --prompt")
-    about = tuple(
-        f"{region.name}: {place.about}, {' x '.join(f'{2 * value:.3g}' for value in region.half_axes)}"
-        for place, region in zip(found, regions, strict=True)
-    )
     return ImportedAsset(
-        scene, places.low, places.high, len(shapes), len(faces), about, tuple(remarks), tuple(dict.fromkeys(notes))
+        scene,
+        places.low,
+        places.high,
+        len(shapes),
+        len(faces),
+        tuple(about),
+        tuple(remarks),
+        tuple(dict.fromkeys(notes)),
     )
 
 

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fd_mitsuba.assets.bsdf_xml import AddImage, bsdf_element
+from fd_mitsuba.assets.region_xml import region_element
 from fd_mitsuba.assets.shapes import SceneShape
 from fd_mitsuba.conventions import BASE_NAME, DEFAULT_PART_NAME
 from fd_mitsuba.io.atomic import write_atomically
@@ -90,32 +91,6 @@ def write_scene(
     return path
 
 
-def region_element(region: PlacedRegion) -> ElementTree.Element:
-    """A `focal_region` with the transform that a person would write."""
-    element = ElementTree.Element("shape", type="focal_region", id=region.name)
-    transform = ElementTree.SubElement(element, "transform", name="to_world")
-    x, y, z = map(_short, region.half_axes)
-    ElementTree.SubElement(transform, "scale", x=x, y=y, z=z)
-    angle = float(np.degrees(np.arccos(np.clip((np.trace(region.rotation) - 1) / 2, -1, 1))))
-    if angle > 1e-4:
-        axis = _axis(region.rotation)
-        x, y, z = map(_short, axis)
-        ElementTree.SubElement(transform, "rotate", x=x, y=y, z=z, angle=_short(angle))
-    x, y, z = map(_short, region.centre)
-    ElementTree.SubElement(transform, "translate", x=x, y=y, z=z)
-    return element
-
-
-def _axis(rotation: np.ndarray) -> np.ndarray:
-    """(3,) the axis of a rotation (3, 3) that is none by 0."""
-    vector = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    if np.linalg.norm(vector) < 1e-6:  # half a turn
-        vector = np.linalg.eigh(rotation + rotation.T)[1][:, -1]
-    return vector / np.linalg.norm(vector)
-
-
 def _shape(shape: SceneShape, name: str, to_scene: np.ndarray, add: AddImage, notes: list[str]) -> ElementTree.Element:
     attributes = {} if shape.colours is None else {"vertex_color": shape.colours}
     data = attribute_ply(shape.vertices, shape.faces, shape.normals, shape.uv, attributes)
@@ -130,7 +105,3 @@ def _shape(shape: SceneShape, name: str, to_scene: np.ndarray, add: AddImage, no
         ElementTree.SubElement(transform, "matrix", value=rows)
     element.append(bsdf_element(shape.material, shape.colours is not None, add, notes))
     return element
-
-
-def _short(value: float) -> str:
-    return f"{value + 0.0:.6g}"

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from fd_mitsuba.cli.options import given_text, say
+from fd_mitsuba.cli.scene_options import axis_options, placing_options
 
 
 def add_import_command(commands: argparse._SubParsersAction) -> None:
@@ -16,32 +17,11 @@ def add_import_command(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--prompt", help="what the edited object should look like")
     parser.add_argument("--base-prompt", help="what it looks like now; default: the prompt up to its `with`")
     placing_options(parser)
-    orientation_options(parser)
+    axis_options(parser)
+    parser.add_argument("--units", metavar="UNIT", choices=("mm", "cm", "m"), help="its unit: mm, cm or m")
     parser.add_argument("--light", metavar="FILE", help="an EXR environment map; default: a shipped one")
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks")
     parser.set_defaults(call=_import)
-
-
-def orientation_options(parser: argparse.ArgumentParser) -> None:
-    """--up, --front, --units."""
-    parser.add_argument("--up", metavar="AXIS", help="the asset's axis that points up, such as z; default: a guess")
-    parser.add_argument("--front", metavar="AXIS", help="its axis to look along, such as -y; default: a guess")
-    parser.add_argument("--units", metavar="UNIT", choices=("mm", "cm", "m"), help="its unit: mm, cm or m")
-
-
-def placing_options(parser: argparse.ArgumentParser) -> None:
-    """--at and --size."""
-    parser.add_argument(
-        "--at",
-        action="append",
-        default=[],
-        metavar="PLACE",
-        help="where a region goes: top, head, back, front, rear, 'left side', bottom, 'front of the head', or x,y,z; "
-        "may be given several times",
-    )
-    parser.add_argument(
-        "--size", metavar="SIZE", help="of these regions: a share of the longest side such as 0.3 or 30%%, or 12u"
-    )
 
 
 def _import(options: argparse.Namespace) -> int:

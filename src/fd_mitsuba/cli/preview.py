@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fd_mitsuba.cli.given_scene import scene_label
 from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import load, scene_options
 from fd_mitsuba.errors import UserError
@@ -20,10 +21,10 @@ def add_preview_command(commands: argparse._SubParsersAction) -> None:
 
 def _preview(options: argparse.Namespace) -> int:
     misplaced: list[UserError] = []
-    scene = load(options, misplaced.append)
+    name = scene_label(options.scene)
+    scene = load(options, misplaced.append, needs_region=False)
     from fd_mitsuba.viewing.preview import preview_scene
 
-    name = Path(options.scene).resolve().parent.name
     folder = Path(options.output) if options.output else Path("runs") / f"{name}_preview"
     for path in preview_scene(scene, folder):
         say(path)

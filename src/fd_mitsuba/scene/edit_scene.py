@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -85,7 +85,7 @@ class EditScene:
     @property
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
-        return self.regions[0].mode == SUBTRACT
+        return bool(self.regions) and self.regions[0].mode == SUBTRACT
 
     @cached_property
     def has_headroom(self) -> bool:
@@ -139,6 +139,7 @@ def load_edit_scene(
     regions: Path | str | None = None,
     prompt: str | None = None,
     on_misplaced: Callable[[UserError], None] | None = None,
+    needs_region: bool = True,
 ) -> EditScene:
     """Read a scene file, check it, and load it once in Mitsuba so that later loading cannot fail.
 
@@ -150,6 +151,7 @@ def load_edit_scene(
         prompt: takes the place of the integrator's; a scene without `dual_path`, as an exported one, needs it.
         on_misplaced: takes what is wrong with the place of a region, which is then kept as it is, so that a picture can
             show it; None: it is raised.
+        needs_region: False: a scene without regions is taken as it is, for a picture of its base.
 
     Raises:
         UserError: any input that cannot be edited, in one line with file, element and remedy.
@@ -161,12 +163,14 @@ def load_edit_scene(
     base = tuple(_base_mesh(file, element) for element in base_elements(file))
     earlier = earlier_parts(file.path, base)
     latest = max(earlier, key=lambda part: part.round, default=None)
+    if not needs_region and prompt is None and not inputs.has_prompt:
+        prompt = file.path.resolve().parent.name or "a scene"
     prompts = inputs.prompts(prompt, "" if latest is None else latest.prompt)
     if not base:
-        raise UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
+        raise _without_base(file)
     frame = _frame(file, base)
     elements = inputs.region_elements()
-    if not elements:
+    if not elements and needs_region:
         remedy = 'add <shape type="focal_region" id="..."> where to edit, or give a file with it by --regions'
         raise UserError(f"{inputs.sources[-1].path}: no focal region; {remedy}")
     names = part_names([element for _, element in elements], earlier)
@@ -209,6 +213,24 @@ def load_edit_scene(
         earlier=earlier,
         warnings=tuple(dict.fromkeys(line for source in inputs.sources for line in source.warnings)),
     )
+
+
+def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> tuple[TriangleMesh, ...]:
+    """The base's meshes in the user frame, of a scene that need not have regions or a prompt yet.
+
+    Raises:
+        UserError: a scene that cannot be read, or without a base.
+    """
+    file = SceneFile(Path(path), dict(parameters or {}))
+    refuse_broken_properties(file)
+    base = tuple(_base_mesh(file, element) for element in base_elements(file))
+    if not base:
+        raise _without_base(file)
+    return base
+
+
+def _without_base(file: SceneFile) -> UserError:
+    return UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
 
 
 def base_elements(file: SceneFile) -> list[SceneElement]:

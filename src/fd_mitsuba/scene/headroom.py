@@ -11,7 +11,7 @@ from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.region_place import share_in_grid
 
-FITS = 0.99
+FITS = 0.999
 """A region with this share of its volume in the paper's grid leaves the paper's frame as it is."""
 LEAST_SCALE = 0.5
 """The base keeps at least this share of its size in the paper's frame."""

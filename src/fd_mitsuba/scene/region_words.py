@@ -156,11 +156,11 @@ class ObjectPlaces:
         """Where a ray from that side meets what is outermost there."""
         along = points @ direction
         reach = max(float(np.ptp(along)), 1e-300)
-        if name in ("front", "rear", "left_side", "right_side", "back"):
-            middle = (self.low + self.high) / 2  # half way up, and where most of the surface is
-            outer = points[along > along.max() - 0.5 * reach]
-            aim = np.median(outer, axis=0)
-            aim = aim if self._walks else np.where(np.abs(_UP) > 0, middle, aim)
+        middle = (self.low + self.high) / 2
+        if name in ("left_side", "right_side"):
+            aim = np.array([middle[0], np.median(self._middle_points()[:, 1]), middle[2]])
+        elif name in ("front", "rear", "back") and not self._walks:
+            aim = np.array([np.median(points[:, 0]), middle[1], middle[2]])
         else:
             aim = points[along > along.max() - 0.15 * reach].mean(axis=0)
         start = aim + direction * (2 * self.longest_side)
