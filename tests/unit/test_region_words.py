@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import fd_mitsuba as fd
 from fd_mitsuba.cli.main import main
@@ -14,6 +16,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import load_base, load_edit_scene
 from fd_mitsuba.scene.region_words import ObjectPlaces, region_size
 from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.viewing.preview import preview_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 ASSETS = Path(__file__).parents[1] / "data" / "assets"
@@ -111,6 +114,30 @@ def test_at_takes_the_place_of_the_scenes_own_regions(make_scene: Make) -> None:
     low, high = (load_base(path)[0].vertices.min(axis=0), load_base(path)[0].vertices.max(axis=0))
     left = scene.frame.to_user(scene.regions[1].centre)
     assert left[0] > 0 and (low[1:] < left[1:]).all() and (left[1:] < high[1:]).all()
+
+
+def test_a_pixel_of_a_preview_is_a_place(make_scene: Make, tmp_path: Path) -> None:
+    path = make_scene(region="", integrator="")
+    bare = load_edit_scene(path, needs_region=False)  # without region or prompt
+    (sheet,) = preview_scene(bare, tmp_path / "out", ["left", "top"], 64)
+    with Image.open(sheet) as image:
+        views = json.loads(image.info["fd_mitsuba"])["views"]
+    places = ObjectPlaces(bare.base_soup.vertices, bare.base_soup.faces)
+    low, high = bare.base_box
+    for view, axis in zip(views, (0, 1), strict=True):
+        middle = (view["left"] + view["size"] // 2, view["top"] + view["size"] // 2)
+        place = places.find(f"pixel {middle[0]} {middle[1]} of {sheet}")
+        along = [i for i in range(3) if i != axis]
+        pixel = 2 * view["half"] / view["size"]
+        assert np.abs(place.point[along] - ((low + high) / 2)[along]).max() <= pixel  # under the picture's middle
+        assert place.point[axis] > ((low + high) / 2)[axis]  # on the side that is seen
+        assert place.normal[axis] > 0.5
+    for text in (f"pixel 0 0 of {sheet}", "pixel 3 3 of none.png", f"pixel 3 3 of {path}"):
+        with pytest.raises(UserError, match=r"beside its views|not found|no preview"):
+            places.find(text)
+    corner = f"pixel {views[0]['left'] + 1} {views[0]['top'] + 1} of {sheet}"
+    with pytest.raises(UserError, match="nothing of the object is seen"):
+        places.find(corner)
 
 
 def test_commands_take_places_and_assets(make_scene: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

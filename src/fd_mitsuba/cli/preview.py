@@ -13,7 +13,7 @@ from fd_mitsuba.errors import UserError
 
 def add_preview_command(commands: argparse._SubParsersAction) -> None:
     """Put `preview` beside the other commands."""
-    preview = commands.add_parser("preview", help="images of the base with the focal regions drawn in")
+    preview = commands.add_parser("preview", help="images of the base from all sides, with its focal regions")
     scene_options(preview)
     preview.add_argument("-o", "--output", metavar="FOLDER", help="default: runs/<scene>_preview")
     preview.set_defaults(call=_preview)
@@ -28,6 +28,8 @@ def _preview(options: argparse.Namespace) -> int:
     folder = Path(options.output) if options.output else Path("runs") / f"{name}_preview"
     for path in preview_scene(scene, folder):
         say(path)
+    low, high = scene.base_box
+    say("base " + ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True)))
     if misplaced:
         raise misplaced[0]
     return 0

@@ -118,6 +118,12 @@ class EditScene:
         """All base meshes as one, user frame, vertices not welded: for distances, not for export."""
         return _soup(self.base)
 
+    @property
+    def base_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner (3,) of the base, user frame."""
+        used = self.base_soup.vertices[np.unique(self.base_soup.faces)]
+        return used.min(axis=0), used.max(axis=0)
+
     @cached_property
     def base_canonical(self) -> TriangleMesh:
         """`base_soup` in the canonical frame."""

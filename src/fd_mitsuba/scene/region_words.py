@@ -10,6 +10,7 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.picture_rays import pixel_ray
 
 DEFAULT_SIZE = 0.3
 """Of a region, as a share of the object's longest side."""
@@ -82,13 +83,18 @@ class ObjectPlaces:
         return float((self.high - self.low).max())
 
     def find(self, text: str) -> Place:
-        """The place that the words of `--at` mean, or the surface's nearest point to `x,y,z`.
+        """The place that the words of `--at` mean, the surface's nearest point to `x,y,z`, or what is seen at a pixel.
+
+        The last is said as "pixel 412 180 of preview.png", of a picture that `fd_mitsuba preview` has made.
 
         Left and right are the object's own: an animal that looks along +z has its left at +x.
 
         Raises:
             UserError: words that are not known, a point that is none.
         """
+        ray = pixel_ray(text)
+        if ray is not None:
+            return self._seen(text, *ray)
         if "," in text:
             return self._point(text)
         words = " ".join(text.lower().replace("_", " ").replace("-", " ").split()).removeprefix("the ")
@@ -180,6 +186,13 @@ class ObjectPlaces:
         hit = MeshDistance(self.vertices, self.faces).feet(point[None])[0]
         shown = ", ".join(f"{value:.4g}" for value in hit)
         return Place("point", hit, self._outward(hit), f"the nearest point of its surface, ({shown})")
+
+    def _seen(self, text: str, origin: np.ndarray, direction: np.ndarray) -> Place:
+        hit = self._hit(origin, direction)
+        if hit is None:
+            raise UserError(f"--at {text}: nothing of the object is seen at that pixel; take one of the object itself")
+        shown = ", ".join(f"{value:.4g}" for value in hit)
+        return Place("point", hit, self._outward(hit), f"what is seen at that pixel, ({shown})")
 
     def _outward(self, point: np.ndarray) -> np.ndarray:
         """The mean normal of the surface within a twentieth of the object around a point."""
