@@ -44,6 +44,7 @@ __all__ = [
     "demo_scene",
     "edit",
     "evaluate",
+    "import_asset",
     "load_scene",
     "register",
 ]
@@ -69,6 +70,7 @@ _PLACES = {
     "demo_scene": ("fd_mitsuba.api", "demo_scene"),
     "edit": ("fd_mitsuba.api", "edit"),
     "evaluate": ("fd_mitsuba.api", "evaluate"),
+    "import_asset": ("fd_mitsuba.api", "import_asset"),
     "load_scene": ("fd_mitsuba.api", "load_scene"),
 }
 """Where the public names live. They are imported when they are first used, so that the package imports in no time."""

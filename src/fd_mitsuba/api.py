@@ -10,8 +10,11 @@ Example:
 
 from __future__ import annotations
 
+import atexit
+import shutil
 import sys
-from collections.abc import Callable, Collection, Mapping
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +26,13 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run import Run
 
 if TYPE_CHECKING:
+    from fd_mitsuba.assets.importing import ImportedAsset
     from fd_mitsuba.guidance.interface import Guidance
     from fd_mitsuba.scene.edit_scene import EditScene
     from fd_mitsuba.training.stage import OnStep
 
 STAGES = ("geometry", "appearance")
+_LIGHT = Path(__file__).with_name("demo") / "lighting" / "city.exr"
 
 
 def demo_scene() -> Path:
@@ -37,6 +42,56 @@ def demo_scene() -> Path:
         scene = fd.load_scene(fd.demo_scene(), prompt="a cat with a pointed hat")
     """
     return Path(__file__).with_name("demo") / "cat" / "scene.xml"
+
+
+def import_asset(
+    path: Path | str,
+    folder: Path | str,
+    *,
+    prompt: str | None = None,
+    base_prompt: str | None = None,
+    up: str | None = None,
+    front: str | None = None,
+    units: str | None = None,
+    at: Sequence[str] = (),
+    size: str | None = None,
+    light: Path | str | None = None,
+) -> ImportedAsset:
+    """Write a scene to edit, with everything that it reads, out of a GLB, glTF, OBJ, PLY, STL or OFF.
+
+    Meshes become PLY, one shape a material, in the asset's own unit and turned so that up is +y and front is +z;
+    materials become `principled` BSDFs; images are kept byte for byte where that is possible. Mitsuba is not started.
+
+    Args:
+        path: the mesh file; its images and material files lie beside it or below its folder.
+        folder: of the scene; must be new or empty.
+        prompt: what the edited object should look like; None: the file's name, for `load_scene(prompt=...)` to say.
+        base_prompt: what it looks like now; None: the prompt up to its "with".
+        up: the asset's axis that points up, such as "z"; None: as the file says, or a guess.
+        front: the axis that it looks along, such as "-y"; None: likewise.
+        units: "mm", "cm" or "m"; None: as the format says.
+        at: places of focal regions; see `scene.region_words`; none: its head.
+        size: of the regions: a share of the longest side such as "0.3", or "12u" in the asset's unit.
+        light: an EXR environment map; None: a shipped one.
+
+    Returns:
+        The scene's path, and what was guessed, left out or understood in another way.
+
+    Raises:
+        UserError: an asset that cannot be read or edited, in one line with file, element and remedy.
+
+    Example:
+        imported = fd.import_asset("duck.glb", "scenes/duck", prompt="a duck with a crown", at=["head"])
+        run = fd.edit(fd.load_scene(imported.scene), output="runs/duck")
+    """
+    from fd_mitsuba.assets.importing import import_file
+
+    for name, text in (("prompt", prompt), ("base_prompt", base_prompt)):
+        if text is not None and not text.strip():
+            raise UserError(f"{name}: is blank; describe the object")
+    told = [None if text is None else " ".join(text.split()) for text in (prompt, base_prompt)]
+    lit = _LIGHT if light is None else Path(light)
+    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size)
 
 
 def load_scene(
@@ -49,6 +104,9 @@ def load_scene(
     variant: str = DEFAULT_VARIANT,
     on_misplaced: Callable[[UserError], None] | None = None,
     plugins: Collection[str] = (),
+    at: Sequence[str] = (),
+    size: str | None = None,
+    needs_region: bool = True,
 ) -> EditScene:
     """Read a scene and start Mitsuba if it has not been started.
 
@@ -63,6 +121,11 @@ def load_scene(
         variant: Mitsuba's.
         on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
         plugins: modules or .py files to import first, which register what the scene names; see docs/extending.md.
+        at: places of focal regions that take the place of the scene's own, such as "head"; see
+            `scene.region_words`. The file of regions that is made of them lies in a temporary folder and is copied
+            into the run.
+        size: of these regions: a share of the base's longest side such as "0.3", or "12u" in the scene's unit.
+        needs_region: False: a scene without regions or prompt is taken as well, to look at its base.
 
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
@@ -78,7 +141,31 @@ def load_scene(
     load_plugins(plugins)
     from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced)
+    if at:
+        regions = _placed(Path(path), dict(parameters or {}), regions, at, size)
+    elif size is not None:
+        raise UserError(f"size {size}: is that of regions to place; say where they go, too")
+    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced, needs_region)
+
+
+def _placed(
+    scene: Path, parameters: dict[str, str], regions: Path | str | None, at: Sequence[str], size: str | None
+) -> Path:
+    """A file of regions at places, which is gone with this process."""
+    from fd_mitsuba.assets.placing import write_placed_regions
+
+    if regions is not None:
+        raise UserError(f"{regions}: regions come from a file or from places to put them; give one of the two")
+    target = temporary_folder() / "regions.xml"
+    write_placed_regions(scene, parameters, at, size, target)
+    return target
+
+
+def temporary_folder() -> Path:
+    """A new folder that goes when this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="fd_mitsuba_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def edit(

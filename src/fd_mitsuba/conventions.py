@@ -4,7 +4,8 @@ Frame
     Right-handed, +y up; an object at azimuth 0 looks at the camera along +z.
     Azimuth grows towards +x (a camera at azimuth 90 sits on +x), elevation towards +y; both in degrees.
     *User frame*: the coordinates of the scene file. *Canonical frame*: the base's bounding box is centred on the
-    origin and its longest side is `BASE_LONGEST_SIDE`; fields, losses and cameras live there.
+    origin and its longest side is `BASE_LONGEST_SIDE`; fields, losses and cameras live there. Where a region would
+    stand out of the grid, base and regions together are centred, and the base is smaller (`scene.headroom`).
 Signed distance
     Inside is **positive**, everywhere. A library that says otherwise is converted where it is called.
 Normals

@@ -53,7 +53,7 @@ def test_scene_is_frozen(make_scene: Make) -> None:
 
 def test_frame_centres_and_scales_and_comes_back(make_scene: Make) -> None:
     base = BASE.replace("<bsdf", move("7", (100, -20, 3)) + "<bsdf")
-    region = '<shape type="focal_region" id="wing">' + move("2", (100, -17, 3)) + "</shape>"
+    region = '<shape type="focal_region" id="wing">' + move("2", (100, -18, 3)) + "</shape>"
     scene = load_edit_scene(make_scene(base=base, region=region))
     canonical = scene.base_canonical.vertices
     low, high = canonical.min(axis=0), canonical.max(axis=0)
@@ -61,7 +61,7 @@ def test_frame_centres_and_scales_and_comes_back(make_scene: Make) -> None:
     back = scene.frame.to_user(scene.frame.to_canonical(scene.base[0].vertices))
     assert np.abs(back - scene.base[0].vertices).max() < 1e-12
     ball = scene.regions[0]
-    assert np.allclose(scene.frame.to_user(ball.centre), [100, -17, 3], atol=1e-5)
+    assert np.allclose(scene.frame.to_user(ball.centre), [100, -18, 3], atol=1e-5)
     assert np.isclose(ball.size / scene.frame.scale, 4.0, atol=1e-5)
 
 
@@ -272,3 +272,22 @@ def test_share_in_grid_of_a_half_hidden_ball() -> None:
     assert share_in_grid(FocalRegion("r", matrix)) == pytest.approx(0.5, abs=0.02)
     matrix[0, 3] = 2.0
     assert share_in_grid(FocalRegion("r", matrix)) == 0.0
+
+
+def test_a_tall_region_makes_room_for_itself(make_scene: Callable[..., Path]) -> None:
+    def region(height: float, y: float) -> str:
+        place = f'<scale x="0.1" y="{height}" z="0.1"/><translate y="{y}"/>'
+        return f'<shape type="focal_region" id="r"><transform name="to_world">{place}</transform></shape>'
+
+    plain = load_edit_scene(make_scene(region=region(0.1, 0.3)))
+    paper = Normalisation.of_points(plain.base_soup.vertices)
+    assert plain.frame.scale == paper.scale and np.array_equal(plain.frame.centre, paper.centre)
+    assert not plain.has_headroom
+    tall = load_edit_scene(make_scene(region=region(0.6, 0.8)))
+    assert tall.has_headroom and share_in_grid(tall.regions[0]) == 1.0
+    # What is said in the scene's units stays where it is.
+    assert np.allclose(tall.frame.to_user(tall.regions[0].centre), [0, 0.8, 0])
+    low, high = tall.base_soup.vertices.min(axis=0), np.maximum(tall.base_soup.vertices.max(axis=0), [-9, 1.4, -9])
+    assert np.allclose(tall.frame.to_canonical(np.stack([low, high]))[:, 1], [-0.975, 0.975], atol=1e-3)
+    with pytest.raises(UserError, match="lies in the editable cube"):  # a base of less than half its size
+        load_edit_scene(make_scene(region=region(2.0, 2.2)))

@@ -25,6 +25,7 @@ from fd_mitsuba.cli.demo import add_demo_command
 from fd_mitsuba.cli.doctor import add_doctor_command
 from fd_mitsuba.cli.evaluate import add_evaluate_commands
 from fd_mitsuba.cli.export import add_export_commands
+from fd_mitsuba.cli.import_asset import add_import_command
 from fd_mitsuba.cli.names import add_names_command
 from fd_mitsuba.cli.options import remark
 from fd_mitsuba.cli.preview import add_preview_command
@@ -112,6 +113,7 @@ def command_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
         add_demo_command,
+        add_import_command,
         add_run_command,
         add_check_command,
         add_preview_command,

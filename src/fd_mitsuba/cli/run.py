@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from fd_mitsuba.backend.processes import processes
+from fd_mitsuba.cli.given_scene import scene_label
 from fd_mitsuba.cli.options import remark, say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
 
@@ -39,12 +40,12 @@ def run_options(parser: argparse.ArgumentParser, folder: str) -> None:
 def run_scene(options: argparse.Namespace) -> int:
     """Edit `options.scene`, print where the result is and how good it is."""
     settings = chosen_settings(options)
-    folder = Path(options.output) if options.output else Path("runs") / Path(options.scene).resolve().parent.name
+    folder = Path(options.output) if options.output else Path("runs") / scene_label(options.scene)
     if options.resume:
         from fd_mitsuba.runs.resumed_scene import resumed_scene
 
         options.scene, options.regions = resumed_scene(folder, options.scene, options.regions, remark)
-    scene = load(options, config=settings.config)
+    scene = load(options, config=settings.config, beside=folder)
     from fd_mitsuba.api import STAGES, edit
 
     run = edit(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fd_mitsuba.cli.options import definitions, given_text, machine_options, quiet_libraries
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
 
 def scene_options(parser: argparse.ArgumentParser) -> None:
     """The scene, -D, --prompt, --regions, and the machine's options."""
-    parser.add_argument("scene", help="Mitsuba scene file (XML)")
+    parser.add_argument("scene", help="Mitsuba scene file (XML), or a mesh file, which is imported first")
     scene_changes(parser)
 
 
 def scene_changes(parser: argparse.ArgumentParser) -> None:
-    """All of `scene_options` but the scene itself."""
+    """All of `scene_options` but the scene itself, in which a mesh file's place is filled by `prepare_scene`."""
     parser.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
     )
@@ -30,7 +31,30 @@ def scene_changes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--regions", metavar="FILE", help="an XML file with focal regions, such as for a scene that was exported"
     )
+    placing_options(parser)
+    axis_options(parser)
     machine_options(parser)
+
+
+def placing_options(parser: argparse.ArgumentParser) -> None:
+    """--at and --size."""
+    parser.add_argument(
+        "--at",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="where a region goes: top, head, back, front, rear, 'left side', 'right side', bottom, 'front of the "
+        "head', or x,y,z; may be given several times",
+    )
+    parser.add_argument(
+        "--size", metavar="SIZE", help="of these regions: a share of the longest side such as 0.3 or 30%%, or 12u"
+    )
+
+
+def axis_options(parser: argparse.ArgumentParser) -> None:
+    """--up and --front."""
+    parser.add_argument("--up", metavar="AXIS", help="a mesh file's axis that points up, such as z; default: a guess")
+    parser.add_argument("--front", metavar="AXIS", help="its axis to look along, such as -y; default: a guess")
 
 
 def settings_options(parser: argparse.ArgumentParser) -> None:
@@ -59,18 +83,29 @@ def load(
     options: argparse.Namespace,
     on_misplaced: Callable[[UserError], None] | None = None,
     config: RunConfig | None = None,
+    beside: Path | None = None,
+    needs_region: bool = True,
 ) -> EditScene:
     """The scene, with Mitsuba started by the options; `on_misplaced` as in `api.load_scene`.
 
     Args:
         config: whose plugins are imported, besides those of the options.
+        beside: the run folder; see `given_scene.prepare_scene`.
+        needs_region: False: a scene without regions is taken, too.
     """
     parameters = definitions(options)
     quiet_libraries(options)
+    plugins = options.plugins if config is None else config.plugins
     if options.prompt is not None and not options.prompt.strip():
         raise UserError("--prompt: is blank; describe the edited object")
     from fd_mitsuba.api import load_scene
+    from fd_mitsuba.backend.threads import share_cores
+    from fd_mitsuba.cli.given_scene import prepare_scene
+    from fd_mitsuba.config.registry import load_plugins
 
+    share_cores(options.threads, options.variant)
+    load_plugins(plugins)
+    prepare_scene(options, beside)
     return load_scene(
         options.scene,
         parameters,
@@ -79,5 +114,6 @@ def load(
         threads=options.threads,
         variant=options.variant,
         on_misplaced=on_misplaced,
-        plugins=options.plugins if config is None else config.plugins,
+        plugins=plugins,
+        needs_region=needs_region,
     )

@@ -17,9 +17,9 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
-from fd_mitsuba.export.mesh_ply import attribute_ply
 from fd_mitsuba.export.solid.cut_base import CutMesh, cut_mesh
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.io.attribute_ply import attribute_ply
 from fd_mitsuba.io.safe_text import safe_name
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance

@@ -19,11 +19,16 @@ def picture_size(path: Path) -> tuple[int, int] | None:
         OSError: the file cannot be read.
     """
     with open(path, "rb") as file:
-        head = file.read(_HEAD)
-        try:
-            return _size(head, file)
-        except (struct.error, ValueError, IndexError):
-            return 0, 0
+        return size_in(file)
+
+
+def size_in(file: BinaryIO) -> tuple[int, int] | None:
+    """As `picture_size`, of a file that is open at its start."""
+    head = file.read(_HEAD)
+    try:
+        return _size(head, file)
+    except (struct.error, ValueError, IndexError):
+        return 0, 0
 
 
 def _size(head: bytes, file: BinaryIO) -> tuple[int, int] | None:

@@ -74,6 +74,8 @@ class CheckReport:
     grid_low: tuple[float, ...]
     grid_high: tuple[float, ...]
     """Corners of the cube in the user's units within which a part can grow."""
+    has_headroom: bool
+    """Whether that cube was moved or enlarged to hold the regions; see `scene.headroom`."""
     regions: tuple[RegionCheck, ...]
     cost: CostEstimate
     warnings: tuple[str, ...]
@@ -104,7 +106,8 @@ class CheckReport:
             lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
         lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
         lines.append(f"         base {_box(self.base_low, self.base_high)}")
-        lines.append(f"         grid {_box(self.grid_low, self.grid_high)}")
+        roomy = ", enlarged to hold the regions" if self.has_headroom else ""
+        lines.append(f"         grid {_box(self.grid_low, self.grid_high)}{roomy}")
         for region in self.regions:
             touch = "touches the base" if region.gap_to_base == 0 else f"{region.gap_to_base:.3g} from the base"
             lines.append(
@@ -157,6 +160,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         grid_cell=cell / scene.frame.scale,
         grid_low=_user_corner(scene, -GRID_HALF_EXTENT),
         grid_high=_user_corner(scene, GRID_HALF_EXTENT),
+        has_headroom=scene.has_headroom,
         regions=regions,
         cost=cost,
         warnings=tuple(

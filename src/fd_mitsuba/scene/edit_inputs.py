@@ -17,7 +17,8 @@ class EditInputs:
     """A scene file, and the file given with `--regions`.
 
     Of the latter only the focal regions, the `dual_path` integrator and `<bsdf id="part">` count. Its regions come
-    after the scene's own; its integrator and its BSDF take the place of the scene's.
+    after the scene's own, or take their place where its integrator has `only_these_regions`; its integrator, if it has
+    a prompt, and its BSDF take the place of the scene's.
     """
 
     scene: SceneFile
@@ -62,10 +63,21 @@ class EditInputs:
         """The focal regions, each with the file that it is in."""
         return [
             (file, element)
-            for file in self.sources
+            for file in (self.sources[-1:] if self.replaces_regions else self.sources)
             for element in file.top_level("shape")
             if element.plugin == FOCAL_REGION
         ]
+
+    @property
+    def replaces_regions(self) -> bool:
+        """Whether the scene's own regions do not count."""
+        integrators = [] if self.regions is None else self.regions.top_level("integrator")
+        return any(item.plugin == DUAL_PATH and item.properties.get("only_these_regions") for item in integrators)
+
+    @property
+    def has_prompt(self) -> bool:
+        """Whether there is an integrator to give one."""
+        return any(item.plugin == DUAL_PATH for file in self.sources for item in file.top_level("integrator"))
 
     def part_bsdf(self) -> tuple[SceneFile, SceneElement | None]:
         """`<bsdf id="part">` and the file that it is in; None and the scene where there is none."""
@@ -87,7 +99,10 @@ class EditInputs:
         """
         integrators: list[SceneElement] = []
         for file in reversed(self.sources):
-            integrators = integrators or [e for e in file.top_level("integrator") if e.plugin == DUAL_PATH]
+            found = [e for e in file.top_level("integrator") if e.plugin == DUAL_PATH]
+            silent = file is self.regions and self.replaces_regions
+            if not silent or any("prompt" in element.properties for element in found):
+                integrators = integrators or found
         if not integrators and prompt is None:
             raise UserError(
                 f'{self.scene.path}: no <integrator type="{DUAL_PATH}">; add it with <string name="prompt" .../>, or '

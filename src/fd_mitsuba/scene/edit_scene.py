@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.file_gate import mark_sound
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion, PartPrompt
+from fd_mitsuba.scene.headroom import frame_with_headroom
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import FILE_SHAPES, BrokenMesh, NotAMesh, shape_triangles
@@ -90,7 +91,14 @@ class EditScene:
     @property
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
-        return self.regions[0].mode == SUBTRACT
+        return bool(self.regions) and self.regions[0].mode == SUBTRACT
+
+    @cached_property
+    def has_headroom(self) -> bool:
+        """Whether the canonical frame is another than the paper's, so that it holds the regions."""
+        soup = self.base_soup
+        paper = Normalisation.of_points(soup.vertices[np.unique(soup.faces)])
+        return paper.scale != self.frame.scale or not np.array_equal(paper.centre, self.frame.centre)
 
     @cached_property
     def origin(self) -> np.ndarray:
@@ -116,6 +124,12 @@ class EditScene:
         """All base meshes as one, user frame, vertices not welded: for distances, not for export."""
         return _soup(self.base)
 
+    @property
+    def base_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner (3,) of the base, user frame."""
+        used = self.base_soup.vertices[np.unique(self.base_soup.faces)]
+        return used.min(axis=0), used.max(axis=0)
+
     @cached_property
     def base_canonical(self) -> TriangleMesh:
         """`base_soup` in the canonical frame."""
@@ -137,6 +151,7 @@ def load_edit_scene(
     regions: Path | str | None = None,
     prompt: str | None = None,
     on_misplaced: Callable[[UserError], None] | None = None,
+    needs_region: bool = True,
 ) -> EditScene:
     """Read a scene file, check it, and load it once in Mitsuba so that later loading cannot fail.
 
@@ -148,6 +163,7 @@ def load_edit_scene(
         prompt: takes the place of the integrator's; a scene without `dual_path`, as an exported one, needs it.
         on_misplaced: takes what is wrong with the place of a region, which is then kept as it is, so that a picture can
             show it; None: it is raised.
+        needs_region: False: a scene without regions is taken as it is, for a picture of its base.
 
     Raises:
         UserError: any input that cannot be edited, in one line with file, element and remedy.
@@ -159,19 +175,26 @@ def load_edit_scene(
     base = tuple(_base_mesh(file, element) for element in base_elements(file))
     earlier = earlier_parts(file.path, base)
     latest = max(earlier, key=lambda part: part.round, default=None)
+    if not needs_region and prompt is None and not inputs.has_prompt:
+        prompt = file.path.resolve().parent.name or "a scene"
     prompts = inputs.prompts(prompt, "" if latest is None else latest.prompt)
     if not base:
-        raise UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
+        raise _without_base(file)
     frame = _frame(file, base)
     elements = inputs.region_elements()
-    if not elements:
+    if not elements and needs_region:
         remedy = 'add <shape type="focal_region" id="..."> where to edit, or give a file with it by --regions'
         raise UserError(f"{inputs.sources[-1].path}: no focal region; {remedy}")
     names = part_names([element for _, element in elements], earlier)
     found = tuple(
         _region(owner, element, index, names[index], frame) for index, (owner, element) in enumerate(elements)
     )
-    soup = TriangleMesh(BASE_NAME, frame.to_canonical(_soup(base).vertices), _soup(base).faces)
+    soup = _soup(base)
+    roomy = frame_with_headroom(frame, soup.vertices[np.unique(soup.faces)], found)
+    if roomy is not frame:
+        found = tuple(region.seen_from(roomy.matrix() @ np.linalg.inv(frame.matrix())) for region in found)
+        frame = roomy
+    soup = TriangleMesh(BASE_NAME, frame.to_canonical(soup.vertices), soup.faces)
     distance = MeshDistance(soup.vertices, soup.faces)
     gaps = [gap_to_base(region, distance, soup) for region in found]
     for (_, element), region, gap in zip(elements, found, gaps, strict=True):
@@ -203,6 +226,24 @@ def load_edit_scene(
         earlier=earlier,
         warnings=tuple(dict.fromkeys(line for source in inputs.sources for line in source.warnings)),
     )
+
+
+def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> tuple[TriangleMesh, ...]:
+    """The base's meshes in the user frame, of a scene that need not have regions or a prompt yet.
+
+    Raises:
+        UserError: a scene that cannot be read, or without a base.
+    """
+    file = SceneFile(Path(path), dict(parameters or {}))
+    refuse_broken_properties(file)
+    base = tuple(_base_mesh(file, element) for element in base_elements(file))
+    if not base:
+        raise _without_base(file)
+    return base
+
+
+def _without_base(file: SceneFile) -> UserError:
+    return UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
 
 
 def base_elements(file: SceneFile) -> list[SceneElement]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -100,6 +100,13 @@ class FocalRegion:
         axes = [np.linspace(a, b, 26)[1:-1] for a, b in zip(low, high, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         return float(max(2.0 * self.sdf(points).max(), 0.0))
+
+    def seen_from(self, change: np.ndarray) -> FocalRegion:
+        """The same region in another canonical frame; `change` (4, 4) is the affine map from this one to that."""
+        mesh = self.mesh
+        if mesh is not None:
+            mesh = replace(mesh, vertices=mesh.vertices @ change[:3, :3].T + change[:3, 3])
+        return replace(self, to_canonical=change @ self.to_canonical, mesh=mesh)
 
     def has_inside(self) -> bool:
         """Whether any point just beside the middle of a face is within the region."""

@@ -14,7 +14,8 @@ class Normalisation:
     """canonical = scale * (user - centre): no rotation, so that axes and angles mean the same in both frames.
 
     Attributes:
-        centre: (3,) float64, centre of the base's bounding box in the user frame.
+        centre: (3,) float64, centre of the base's bounding box in the user frame, or of that of base and regions
+            where these need room (`headroom`).
         scale: canonical units a user unit, positive.
     """
 

@@ -21,7 +21,10 @@ _BY_PLUGIN: dict[str, dict[str, str]] = {
     "bitmap": {"raw": BOOLEAN, "wrap_mode": TEXT, "filter_type": TEXT, "to_uv": TRANSFORM},
     "mesh_attribute": {"name": TEXT, "scale": NUMBER},
     FOCAL_REGION: {name: TEXT for name in ("part", "mode", "prompt", "negative_prompt")},
-    DUAL_PATH: {name: TEXT for name in ("prompt", "base_prompt", "negative_prompt", "simple_prompt")},
+    DUAL_PATH: {
+        **{name: TEXT for name in ("prompt", "base_prompt", "negative_prompt", "simple_prompt")},
+        "only_these_regions": BOOLEAN,
+    },
 }
 _BY_KIND: dict[str, dict[str, str]] = {"shape": {"to_world": TRANSFORM}, "emitter": {"to_world": TRANSFORM}}
 _EVERYWHERE = {"filename": TEXT}

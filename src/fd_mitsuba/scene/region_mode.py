@@ -54,7 +54,7 @@ def check_modes(
             raise element.error(
                 f"cutting out part {region.part!r} makes a second shape {clash!r}; give another part name"
             )
-    if regions[0].mode != SUBTRACT:
+    if not regions or regions[0].mode != SUBTRACT:
         return
     left = False
     for mesh in base:

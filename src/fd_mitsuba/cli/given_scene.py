@@ -1,0 +1,96 @@
+"""What stands behind the scene argument of a command: a scene file, or a mesh file that is imported on the way."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from fd_mitsuba.assets.readers import READERS
+from fd_mitsuba.cli.options import definitions, given_text, remark
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.json_object import read_json_object, write_json
+
+_RECORD = "import.json"
+
+
+def scene_label(scene: str) -> str:
+    """What a scene is called in names of folders: that of its own folder, or of a mesh file."""
+    path = Path(scene)
+    return path.stem if is_asset(scene) else path.resolve().parent.name
+
+
+def is_asset(scene: str) -> bool:
+    """Whether the argument names a mesh file and no scene."""
+    return Path(scene).suffix.lower() in READERS
+
+
+def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callable[[str], None] = remark) -> None:
+    """Import a mesh file and put the regions of `--at`, so that `options.scene` and `options.regions` are files.
+
+    Args:
+        options: of a command with `scene_changes`; changed in place.
+        beside: the run folder, beside which what is made stays: `<run>.scene` and `<run>.regions.xml`; None: it is
+            needed by this command alone, and goes when the process ends.
+        say: takes a line about what was made.
+
+    Raises:
+        UserError: options that do not fit each other, an asset or a scene that cannot be read.
+    """
+    if is_asset(options.scene):
+        options.scene = str(_imported(options, beside, say))
+        return
+    for name in ("up", "front"):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name}: is for mesh files; a scene's to_world turns its shapes")
+    if not options.at:
+        if options.size is not None:
+            raise UserError("--size: is that of the regions of --at; say where they go, too")
+        return
+    if options.regions is not None:
+        raise UserError("--at and --regions: give one of the two")
+    from fd_mitsuba.api import temporary_folder
+    from fd_mitsuba.assets.placing import write_placed_regions
+
+    folder = temporary_folder() if beside is None else beside.parent
+    target = folder / ("regions.xml" if beside is None else f"{beside.name}.regions.xml")
+    about = write_placed_regions(Path(options.scene), definitions(options), options.at, options.size, target)
+    for line in about:
+        say(f"region {line}; in place of the scene's own")
+    options.regions = str(target)
+
+
+def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[str], None]) -> Path:
+    from fd_mitsuba.api import import_asset, temporary_folder
+
+    asset = Path(options.scene)
+    if options.regions is not None and options.at:
+        raise UserError("--at and --regions: give one of the two")
+    wanted = {
+        "prompt": None if options.prompt is None else given_text("--prompt", options.prompt),
+        "up": options.up,
+        "front": options.front,
+        "at": list(options.at),
+        "size": options.size,
+    }
+    folder = temporary_folder() / asset.stem if beside is None else beside.with_name(f"{beside.name}.scene")
+    record = {"asset": asset.name, "options": wanted, "bytes": _bytes(asset)}
+    before = read_json_object(folder / _RECORD)
+    if before is not None and {key: before.get(key) for key in record} == json.loads(json.dumps(record)):
+        return folder / "scene.xml"
+    if before is not None and set(before.get("files") or []) >= {path.name for path in folder.iterdir()}:
+        shutil.rmtree(folder)  # made by an import of something else, and by nobody else
+    imported = import_asset(asset, folder, **wanted)
+    write_json(folder / _RECORD, record | {"files": sorted({path.name for path in folder.iterdir()} | {_RECORD})})
+    kept = "" if beside is None else f" imported to {imported.scene}"
+    say(f"{asset}:{kept or ' imported'}; {'; '.join([*imported.regions, *imported.remarks, *imported.notes])}")
+    return imported.scene
+
+
+def _bytes(asset: Path) -> int:
+    try:
+        return asset.stat().st_size
+    except OSError:
+        return -1

@@ -1,0 +1,262 @@
+"""Places on an object by words: `top`, `head`, `left side`, `front of the head`, or a point; and the region there."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.picture_rays import pixel_ray
+
+DEFAULT_SIZE = 0.3
+"""Of a region, as a share of the object's longest side."""
+_REACH = 0.3
+"""Share of a region's half axis by which it reaches into the object."""
+_SAMPLES = 20_000
+_UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
+_DIRECTIONS = {
+    "top": _UP, "bottom": -_UP, "front": _FRONT, "rear": -_FRONT, "left side": _LEFT, "right side": -_LEFT,
+}  # fmt: skip
+_SYNONYMS = {
+    "above": "top", "below": "bottom", "underside": "bottom", "left": "left side", "right": "right side",
+    "behind": "rear", "back side": "rear", "backside": "rear", "top of the head": "head", "on the head": "head",
+    "top of head": "head", "chest": "front", "belly": "bottom",
+}  # fmt: skip
+WORDS = ("top", "head", "back", "front", "rear", "left side", "right side", "bottom")
+"""What `--at` knows, beside `front of the head` and the like, and points."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point of a surface.
+
+    Attributes:
+        name: for the region there, of letters and `_`.
+        point: (3,) on the surface.
+        normal: (3,) unit, out of the object.
+        about: what was understood, for people.
+    """
+
+    name: str
+    point: np.ndarray
+    normal: np.ndarray
+    about: str
+
+
+@dataclass(frozen=True)
+class PlacedRegion:
+    """An ellipsoid: the unit sphere scaled by `half_axes`, turned by `rotation` (3, 3), moved to `centre`."""
+
+    name: str
+    centre: np.ndarray
+    half_axes: np.ndarray
+    rotation: np.ndarray
+
+    def to_world(self) -> np.ndarray:
+        """(4, 4) from the unit sphere."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation * self.half_axes
+        matrix[:3, 3] = self.centre
+        return matrix
+
+
+class ObjectPlaces:
+    """Finds places on an object that has +y up and looks along +z.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: (F, 3) outward.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self.vertices, self.faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+        used = self.vertices[np.unique(self.faces)]
+        self.low, self.high = used.min(axis=0), used.max(axis=0)
+
+    @property
+    def longest_side(self) -> float:
+        """Of the bounding box."""
+        return float((self.high - self.low).max())
+
+    def find(self, text: str) -> Place:
+        """The place that the words of `--at` mean, the surface's nearest point to `x,y,z`, or what is seen at a pixel.
+
+        The last is said as "pixel 412 180 of preview.png", of a picture that `fd_mitsuba preview` has made.
+
+        Left and right are the object's own: an animal that looks along +z has its left at +x.
+
+        Raises:
+            UserError: words that are not known, a point that is none.
+        """
+        ray = pixel_ray(text)
+        if ray is not None:
+            return self._seen(text, *ray)
+        if "," in text:
+            return self._point(text)
+        words = " ".join(text.lower().replace("_", " ").replace("-", " ").split()).removeprefix("the ")
+        words = _SYNONYMS.get(words, words)
+        of_head = re.fullmatch(r"(.+?) of (?:the )?head", words)
+        side = _SYNONYMS.get(of_head[1], of_head[1]) if of_head else words
+        if of_head:
+            side = {"back": "rear"}.get(side, side)
+        if of_head and side in _DIRECTIONS:
+            return self._side(_DIRECTIONS[side], f"{side}_of_head", self._head_points(), f"the {side} of its head")
+        if words == "head":
+            return self._side(_UP, "head", self._head_points(), "the top of its head")
+        if words == "back":
+            if self._walks:
+                return self._side(_UP, "back", self._middle_points(), "its back, seen from above")
+            return self._side(-_FRONT, "back", self._points, "its back, away from where it looks")
+        if words in _DIRECTIONS:
+            return self._side(_DIRECTIONS[words], words.replace(" ", "_"), self._points, f"its {words}")
+        raise UserError(f"--at {text}: is not known; say {', '.join(WORDS)}, 'front of the head', or x,y,z")
+
+    def region(self, place: Place, size: float | tuple[float, ...], name: str | None = None) -> PlacedRegion:
+        """The ellipsoid at a place, which reaches a little into the object.
+
+        Args:
+            size: its width, or width, height and depth, in the object's unit: height is along the place's normal.
+        """
+        extent = np.broadcast_to(np.asarray(size, dtype=np.float64), (3,))
+        half = extent / 2
+        centre = place.point + (1 - _REACH) * half[1] * place.normal
+        return PlacedRegion(name or place.name, centre, half, _upright(place.normal))
+
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        return self.vertices[self.faces]
+
+    @cached_property
+    def _points(self) -> np.ndarray:
+        """(N, 3) points all over the surface, evenly by area."""
+        corners = self._corners
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        random = np.random.default_rng(0)
+        chosen = random.choice(len(corners), size=_SAMPLES, p=area / area.sum())
+        return np.einsum("ij,ijk->ik", random.dirichlet([1.0, 1.0, 1.0], size=_SAMPLES), corners[chosen])
+
+    @cached_property
+    def _walks(self) -> bool:
+        """Whether it is longer than it is high, as animals on four legs are."""
+        size = self.high - self.low
+        return bool(size[2] > size[1])
+
+    def _head_points(self) -> np.ndarray:
+        """The upper end of an upright object; of a long one the upper part of its front."""
+        points, size = self._points, self.high - self.low
+        if self._walks:
+            points = points[points[:, 2] > self.high[2] - 0.3 * size[2]]
+        top = points[:, 1].max()
+        return points[points[:, 1] > top - 0.25 * size[1]]
+
+    def _middle_points(self) -> np.ndarray:
+        points, size = self._points, self.high - self.low
+        middle = (self.low[2] + self.high[2]) / 2
+        return points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
+
+    def _side(self, direction: np.ndarray, name: str, points: np.ndarray, about: str) -> Place:
+        """Where a ray from that side meets what is outermost there."""
+        along = points @ direction
+        reach = max(float(np.ptp(along)), 1e-300)
+        middle = (self.low + self.high) / 2
+        if name in ("left_side", "right_side"):
+            aim = np.array([middle[0], np.median(self._middle_points()[:, 1]), middle[2]])
+        elif name in ("front", "rear", "back") and not self._walks:
+            aim = np.array([np.median(points[:, 0]), middle[1], middle[2]])
+        else:
+            aim = points[along > along.max() - 0.15 * reach].mean(axis=0)
+        start = aim + direction * (2 * self.longest_side)
+        hit = self._hit(start, -direction)
+        if hit is None:
+            near = points[along > along.max() - 0.15 * reach]
+            hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
+        return Place(name, hit, direction.astype(np.float64), about)
+
+    def _point(self, text: str) -> Place:
+        try:
+            point = np.array([float(value) for value in text.split(",")])
+        except ValueError:
+            point = np.zeros(0)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise UserError(f"--at {text}: is no point; write x,y,z in the scene's unit, such as 0,1.5,0.2")
+        hit = MeshDistance(self.vertices, self.faces).feet(point[None])[0]
+        shown = ", ".join(f"{value:.4g}" for value in hit)
+        return Place("point", hit, self._outward(hit), f"the nearest point of its surface, ({shown})")
+
+    def _seen(self, text: str, origin: np.ndarray, direction: np.ndarray) -> Place:
+        hit = self._hit(origin, direction)
+        if hit is None:
+            raise UserError(f"--at {text}: nothing of the object is seen at that pixel; take one of the object itself")
+        shown = ", ".join(f"{value:.4g}" for value in hit)
+        return Place("point", hit, self._outward(hit), f"what is seen at that pixel, ({shown})")
+
+    def _outward(self, point: np.ndarray) -> np.ndarray:
+        """The mean normal of the surface within a twentieth of the object around a point."""
+        corners = self._corners
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        distance = np.linalg.norm(corners.mean(axis=1) - point, axis=1)
+        near = distance <= max(0.05 * self.longest_side, float(distance.min()) * 1.001)
+        normal = area[near].sum(axis=0)
+        length = np.linalg.norm(normal)
+        return normal / length if length > 0 else _UP.astype(np.float64)
+
+    def _hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """The first point of the surface along a ray."""
+        a, b, c = self._corners.transpose(1, 0, 2)
+        across = np.cross(direction, c - a)
+        determinant = np.einsum("ij,ij->i", b - a, across)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1.0 / determinant
+            offset = origin - a
+            u = np.einsum("ij,ij->i", offset, across) * inverse
+            turned = np.cross(offset, b - a)
+            v = turned @ direction * inverse
+            t = np.einsum("ij,ij->i", c - a, turned) * inverse
+            valid = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
+        return origin + t[valid].min() * direction if valid.any() else None
+
+
+def region_size(text: str | None, longest_side: float) -> tuple[float, float, float]:
+    """Width, height and depth in the object's unit of what `--size` says.
+
+    Args:
+        text: a share of the longest side, as `0.3` or `30%`; three of them, with commas; `8u` is in the scene's unit.
+
+    Raises:
+        UserError: anything else, and sizes beyond 0.02 to 2 longest sides.
+    """
+    if text is None:
+        return (DEFAULT_SIZE * longest_side,) * 3
+    values = []
+    for word in text.split(","):
+        found = re.fullmatch(r"\s*([\d.]+(?:[eE][-+]?\d+)?)\s*(%|u)?\s*", word)
+        try:
+            number = float(found[1]) if found else 0.0
+        except ValueError:
+            number = 0.0
+        unit = found[2] if found else None
+        value = number if unit == "u" else number * longest_side / (100 if unit == "%" else 1)
+        if not 0.02 * longest_side <= value <= 2 * longest_side:
+            raise UserError(
+                f"--size {text}: give a share of the longest side from 0.02 to 2, such as 0.3 or 30%, or a length in "
+                f"the scene's unit, such as {0.3 * longest_side:.3g}u"
+            )
+        values.append(value)
+    if len(values) not in (1, 3):
+        raise UserError(f"--size {text}: give one size, or three: width, height, depth")
+    return tuple(values * 3) if len(values) == 1 else tuple(values)  # type: ignore[return-value]
+
+
+def _upright(normal: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation that takes +y to `normal`, and turns no more than that needs."""
+    if normal[1] > 1 - 1e-9:
+        return np.eye(3)
+    if normal[1] < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.cross(_UP, normal)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + normal[1])

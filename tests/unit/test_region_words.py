@@ -1,0 +1,162 @@
+"""Places by words, on shapes whose places are known, on the shipped scenes, and through the commands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import fd_mitsuba as fd
+from fd_mitsuba.cli.main import main
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.edit_scene import load_base, load_edit_scene
+from fd_mitsuba.scene.region_words import ObjectPlaces, region_size
+from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.viewing.preview import preview_scene
+
+SCENES = Path(__file__).parents[2] / "scenes"
+ASSETS = Path(__file__).parents[1] / "data" / "assets"
+Make = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def beast() -> ObjectPlaces:
+    """A long body, a head in front of it and higher, a tail tip behind; looks along +z."""
+    vertices, faces = unit_sphere(3)
+    pieces = [([0.3, 0.3, 1.0], [0, 1, 0]), ([0.25, 0.25, 0.25], [0, 1.5, 1]), ([0.05, 0.05, 0.2], [0, 1.1, -1.1])]
+    points = [vertices * radii + centre for radii, centre in pieces]
+    return ObjectPlaces(
+        np.concatenate(points), np.concatenate([faces + number * len(vertices) for number in range(len(pieces))])
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "point", "normal"),
+    [
+        ("head", (0, 1.75, 1), (0, 1, 0)),
+        ("top", (0, 1.75, 1), (0, 1, 0)),
+        ("the back", (0, 1.3, 0), (0, 1, 0)),
+        ("front of the head", (0, 1.5, 1.25), (0, 0, 1)),
+        ("Left side of head", (0.25, 1.5, 1), (1, 0, 0)),
+        ("left side", (0.3, 1, 0), (1, 0, 0)),
+        ("right", (-0.3, 1, 0), (-1, 0, 0)),
+        ("bottom", (0, 0.7, 0), (0, -1, 0)),
+        ("0, 1.9, 1", (0, 1.75, 1), (0, 1, 0)),
+    ],
+)
+def test_words_find_the_place(beast: ObjectPlaces, words: str, point: tuple, normal: tuple) -> None:
+    place = beast.find(words)
+    assert np.allclose(place.point, point, atol=0.1) and np.allclose(place.normal, normal, atol=0.1)
+    # It is a point of the surface: one of the three ellipsoids, whose faces lie a little within.
+    region = beast.region(place, 0.4)
+    assert np.allclose(region.centre - place.point, 0.7 * 0.2 * place.normal)
+
+
+def test_front_and_rear_are_the_ends(beast: ObjectPlaces) -> None:
+    assert beast.find("front").point[2] > 0.9 and beast.find("rear").point[2] < -0.9
+
+
+def test_the_back_of_what_stands_upright_is_behind() -> None:
+    vertices, faces = unit_sphere(3)
+    upright = ObjectPlaces(vertices * [0.5, 1, 0.4], faces)
+    assert np.allclose(upright.find("back").point, [0, 0, -0.4], atol=0.02)
+    assert np.allclose(upright.find("head").point, [0, 1, 0], atol=0.02)
+
+
+@pytest.mark.parametrize("words", ["knee", "front of the knee", "1,2", "1,2,nan", "1,2,x", ""])
+def test_unknown_places_are_refused(beast: ObjectPlaces, words: str) -> None:
+    with pytest.raises(UserError, match="--at"):
+        beast.find(words)
+
+
+def test_sizes() -> None:
+    assert region_size(None, 10) == (3.0, 3.0, 3.0) and region_size("30%", 10) == (3.0, 3.0, 3.0)
+    assert region_size("0.2", 10) == (2.0, 2.0, 2.0) and region_size("5u", 10) == (5.0, 5.0, 5.0)
+    assert region_size("0.2,50%,1u", 10) == (2.0, 5.0, 1.0)
+    for wrong in ("", "0", "3", "x", "1,2", "0.1u", "-1", "5cm"):
+        with pytest.raises(UserError, match="--size"):
+            region_size(wrong, 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "region"),
+    [
+        ("cat", "head", "head_top"),
+        ("unicorn", "head", "horn"),
+        ("snowman", "head", "hat"),
+        ("teddy_backpack", "back", "backpack"),
+        ("superhero", "back", None),
+    ],
+)
+def test_places_are_where_the_shipped_scenes_have_their_regions(name: str, words: str, region: str | None) -> None:
+    scene = load_edit_scene(SCENES / name / "scene.xml")
+    (mesh,) = [scene.base_soup]
+    place = ObjectPlaces(mesh.vertices, mesh.faces).find(words)
+    centre = scene.frame.to_canonical(place.point)
+    nearest = min(np.linalg.norm(other.centre - centre) for other in scene.regions)
+    assert nearest < 0.45, (nearest, [other.name for other in scene.regions])  # of a longest side of 1.8
+
+
+def test_at_takes_the_place_of_the_scenes_own_regions(make_scene: Make) -> None:
+    path = make_scene()
+    scene = fd.load_scene(path, at=["head", "left side", "head"], size="20%")
+    assert [region.name for region in scene.regions] == ["head_1", "left_side", "head_3"]
+    assert scene.prompt == "a pig with two wings" and scene.base_prompt == "a pig"
+    longest = np.ptp(scene.base_soup.vertices, axis=0).max()
+    assert np.isclose(scene.regions[0].size / scene.frame.scale, 0.2 * longest, rtol=1e-4)
+    again = load_edit_scene(path, regions=scene.regions_path)  # as a run is opened later
+    assert np.allclose(again.regions[1].to_canonical, scene.regions[1].to_canonical)
+    assert [region.name for region in load_edit_scene(path).regions] == ["wing"]
+    low, high = (load_base(path)[0].vertices.min(axis=0), load_base(path)[0].vertices.max(axis=0))
+    left = scene.frame.to_user(scene.regions[1].centre)
+    assert left[0] > 0 and (low[1:] < left[1:]).all() and (left[1:] < high[1:]).all()
+
+
+def test_a_pixel_of_a_preview_is_a_place(make_scene: Make, tmp_path: Path) -> None:
+    path = make_scene(region="", integrator="")
+    bare = load_edit_scene(path, needs_region=False)  # without region or prompt
+    (sheet,) = preview_scene(bare, tmp_path / "out", ["left", "top"], 64)
+    with Image.open(sheet) as image:
+        views = json.loads(image.info["fd_mitsuba"])["views"]
+    places = ObjectPlaces(bare.base_soup.vertices, bare.base_soup.faces)
+    low, high = bare.base_box
+    for view, axis in zip(views, (0, 1), strict=True):
+        middle = (view["left"] + view["size"] // 2, view["top"] + view["size"] // 2)
+        place = places.find(f"pixel {middle[0]} {middle[1]} of {sheet}")
+        along = [i for i in range(3) if i != axis]
+        pixel = 2 * view["half"] / view["size"]
+        assert np.abs(place.point[along] - ((low + high) / 2)[along]).max() <= pixel  # under the picture's middle
+        assert place.point[axis] > ((low + high) / 2)[axis]  # on the side that is seen
+        assert place.normal[axis] > 0.5
+    for text in (f"pixel 0 0 of {sheet}", "pixel 3 3 of none.png", f"pixel 3 3 of {path}"):
+        with pytest.raises(UserError, match=r"beside its views|not found|no preview"):
+            places.find(text)
+    corner = f"pixel {views[0]['left'] + 1} {views[0]['top'] + 1} of {sheet}"
+    with pytest.raises(UserError, match="nothing of the object is seen"):
+        places.find(corner)
+
+
+def test_commands_take_places_and_assets(make_scene: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    scene = str(make_scene())
+    assert main(["check", scene, "--at", "head", "-c", "smoke"]) == 0
+    out, err = capfd.readouterr()
+    assert "region   head (part part)" in out and "region   wing" not in out and "in place of the scene's own" in err
+    box = str(ASSETS / "box.glb")
+    assert main(["check", box, "--prompt", "a box with a hat", "--at", "top", "--set", "geometry.lambda_sds=0"]) == 0
+    out, err = capfd.readouterr()
+    assert "prompt   a box with a hat" in out and "region   top" in out and err.count("\n") == 1
+    for arguments, words in (
+        ([scene, "--up", "z"], "--up: is for mesh files"),
+        ([scene, "--size", "0.3"], "--size"),
+        ([scene, "--at", "knee"], "--at knee"),
+        ([scene, "--at", "head", "--regions", scene], "give one of the two"),
+        ([box, "--at", "head", "--regions", scene], "give one of the two"),
+        ([str(tmp_path / "none.glb")], "not found"),
+    ):
+        assert main(["check", *arguments]) == 1
+        line = capfd.readouterr().err
+        assert words in line and line.count("\n") == 1, line
