@@ -44,29 +44,29 @@ def session(scene: Path, tmp_path: Path):
 def test_what_a_person_does_is_heard_and_kept(session: Session, scene: Path, tmp_path: Path) -> None:
     topics: list[str] = []
     session.subscribe(topics.append)
-    before = session.regions.poses["wing"]
+    before = session.state.regions.poses["wing"]
     session.put(replace(before, centre=(0.2, 0.3, 0.0)))
-    session.put(session.regions.poses["wing"])  # what a field echoes is no change
+    session.put(session.state.regions.poses["wing"])  # what a field echoes is no change
     image = session.mirror("wing")
     session.set_prompt("  a pig with \n a hat ")
     session.set_prompt("a pig with a hat")
     session.set_settings(seed=3, steps=7)
     assert topics == ["pose", "regions", "prompt", "settings"]
-    assert session.selected == image == "wing_mirrored"
-    assert session.settings.config().geometry.steps == 7 and session.settings.config().seed == 3
+    assert session.state.selected == image == "wing_mirrored"
+    assert session.state.settings.config().geometry.steps == 7 and session.state.settings.config().seed == 3
     session.save()
     again = opened(scene, tmp_path / "work")
-    assert again.regions.poses == session.regions.poses and again.prompt == "a pig with a hat"
-    assert (again.settings, again.selected) == (session.settings, image)
+    assert again.state.regions.poses == session.state.regions.poses and again.state.prompt == "a pig with a hat"
+    assert (again.state.settings, again.state.selected) == (session.state.settings, image)
     again.close()
 
 
 def test_a_click_puts_a_region_on_the_base(session: Session) -> None:
     name = session.add_at([0.0, 3.0, 0.0], [0.0, -1.0, 0.0])
-    assert name == "region" and session.selected == name
-    pose = session.regions.poses[name]
-    top = session.scene.base_canonical.vertices[:, 1].max()
-    height = session.scene.frame.to_canonical(np.array(pose.centre))[1]
+    assert name == "region" and session.state.selected == name
+    pose = session.state.regions.poses[name]
+    top = session.state.scene.base_canonical.vertices[:, 1].max()
+    height = session.state.scene.frame.to_canonical(np.array(pose.centre))[1]
     assert height < top + 0.25 and pose.part == "part"
     assert session.add_at([0.0, 3.0, 0.0], [0.0, 1.0, 0.0]) is None
     assert session.add() == "region_2"
@@ -80,8 +80,12 @@ def test_check_reads_the_prompt_and_refuses(session: Session) -> None:
     session.set_prompt("a pig with a submarine")
     with pytest.raises(UserError, match="the built-in prior knows no"):
         session.grow()
+    session.set_prompt(" ")
+    assert "prompt is blank" in str(session.check_now().refusal)
+    with pytest.raises(UserError, match="prompt is blank"):
+        session.save_scene()
     session.set_prompt("a pig with wings")
-    session.put(replace(session.regions.poses["wing"], centre=(0.0, 40.0, 0.0)))
+    session.put(replace(session.state.regions.poses["wing"], centre=(0.0, 40.0, 0.0)))
     assert "lies in the editable cube" in str(session.check_now().refusal)
     with pytest.raises(UserError, match="move or shrink it"):
         session.grow()
@@ -89,7 +93,7 @@ def test_check_reads_the_prompt_and_refuses(session: Session) -> None:
 
 
 def test_grow_makes_an_order_that_can_be_run_by_itself(session: Session, scene: Path) -> None:
-    session.put(replace(session.regions.poses["wing"], centre=(0.1, 0.35, 0.0)))
+    session.put(replace(session.state.regions.poses["wing"], centre=(0.1, 0.35, 0.0)))
     first = session.grow()
     second = session.another_seed()
     assert (first, second) == ("001", "002") and session.shown == second
@@ -97,15 +101,15 @@ def test_grow_makes_an_order_that_can_be_run_by_itself(session: Session, scene: 
     order = RunOrder.read(run.folder)
     assert run.state == QUEUED and order.config["seed"] == 0 and session.queue.runs[second].seed == 1
     grown = load_edit_scene(run.folder / order.scene)
-    assert np.allclose(grown.regions[0].to_canonical, session.regions.focal_regions()[0].to_canonical, atol=1e-7)
+    assert np.allclose(grown.regions[0].to_canonical, session.state.regions.focal_regions()[0].to_canonical, atol=1e-7)
     assert b"<!-- mine -->" in (run.folder / order.scene).read_bytes()
-    assert scene.read_bytes() == session.source.text  # the user's own file is as it was
+    assert scene.read_bytes() == session.state.source.text  # the user's own file is as it was
 
 
 def test_save_scene_keeps_everything_else(session: Session, scene: Path) -> None:
     before = scene.read_text()
     assert session.save_scene() == "scene.xml has all that already"
-    session.put(replace(session.regions.poses["wing"], radii=(0.2, 0.2, 0.2)))
+    session.put(replace(session.state.regions.poses["wing"], radii=(0.2, 0.2, 0.2)))
     session.set_prompt("a pig with a horn")
     assert session.save_scene() == "saved in scene.xml"
     after = scene.read_text()
@@ -117,7 +121,7 @@ def test_save_scene_keeps_everything_else(session: Session, scene: Path) -> None
     assert len(after.splitlines()) - len(before.splitlines()) == 3
     saved = load_edit_scene(scene)
     assert saved.prompt == "a pig with a horn"
-    assert np.allclose(saved.regions[0].to_canonical, session.regions.focal_regions()[0].to_canonical)
+    assert np.allclose(saved.regions[0].to_canonical, session.state.regions.focal_regions()[0].to_canonical)
     assert session.save_scene() == "scene.xml has all that already"
 
 
@@ -135,7 +139,7 @@ def test_scene_that_was_edited_meanwhile_is_taken_anew(session: Session, scene: 
     session.save()
     scene.write_text(scene.read_text().replace("two wings", "a tail"))
     again = opened(scene, tmp_path / "work")
-    assert again.prompt == "a pig with a tail"
+    assert again.state.prompt == "a pig with a tail"
     again.close()
     elsewhere = scene.with_name("other.xml")
     elsewhere.write_text(scene.read_text())
@@ -149,7 +153,7 @@ def test_work_folder_is_enough_to_start_again(session: Session, scene: Path, tmp
     session.queue.stop(name)
     session.close()
     again = opened(tmp_path / "work", tmp_path / "work")
-    assert again.prompt == "a pig with a horn" and again.shown == name
+    assert again.state.prompt == "a pig with a horn" and again.shown == name
     again.queue.resume(name)
     assert RunOrder.read(again.queue.runs[name].folder).resume
     again.close()
@@ -173,12 +177,15 @@ def test_damaged_record_leaves_the_scene(session: Session, scene: Path, tmp_path
     record["regions"] = [{"name": "wing"}]
     session.work.record.write_text(json.dumps(record))
     again = opened(scene, tmp_path / "work")
-    assert again.regions.poses == session.regions.poses
+    assert again.state.regions.poses == session.state.regions.poses
     again.close()
 
 
 def test_edit_again_needs_a_result(session: Session) -> None:
-    with pytest.raises(UserError, match="run -: has no result yet"):
+    name = session.grow()
+    with pytest.raises(UserError, match="run 001: has no result yet"):
+        session.edit_again(name)
+    with pytest.raises(UserError, match="there is no run yet"):
         session.edit_again("")
 
 

@@ -5,7 +5,7 @@ In that frame every base is about two units long, so that gizmo, camera and grid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,9 @@ from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 if TYPE_CHECKING:
     import viser
 
-CAMERA = np.array([1.6, 1.1, 2.6])
+CAMERA, FOV_DEG = (2.3, 1.6, 3.75), 40.0
+"""Where a tab looks from at first, towards the origin: it sees the whole cube."""
+GIZMO_SCALE = 0.42
 _COLOURS = [(242, 142, 43), (78, 121, 167), (89, 161, 79), (176, 122, 161), (225, 87, 89), (118, 183, 178)]
 _PART = (226, 178, 66)
 _LINES = (60, 60, 60)
@@ -47,24 +49,27 @@ class Canvas:
         self.server, self._scene = server, server.scene
         self._on_region, self._on_gizmo, self._on_base = on_region, on_gizmo, on_base
         self._regions: dict[str, Any] = {}
+        self._clickable: set[str] = set()
+        self._meshes: set[str] = set()
         self._gizmo: Any = None
         self._base: Any = None
-        self._base_lines: Any = None
         self._part: Any = None
-        self._part_lines: Any = None
+        self._wires: dict[str, tuple[np.ndarray, np.ndarray, Any]] = {}
+        """`base` and `part` -> vertices, faces, and the lines once somebody wanted to see them."""
         self.base_hidden = False
         """Whether the part's GLB has the base in it."""
         self.visible = {"base": True, "part": True, "regions": True, "wireframe": False, "grid": True}
         self._scene.set_up_direction("+y")
         camera = server.initial_camera
-        camera.position, camera.look_at, camera.up = tuple(CAMERA), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+        camera.position, camera.look_at, camera.up = CAMERA, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+        camera.fov = float(np.radians(FOV_DEG))
         self._grid = self._scene.add_line_segments("/grid", _box_edges(GRID_HALF_EXTENT), _LINES, line_width=1.0)
 
     def show_base(self, glb: bytes, frame: Normalisation, soup: TriangleMesh) -> None:
         """The base, from a GLB in the user frame; `soup` is the same in the canonical frame, for its wires."""
         with self.server.atomic():
             self._base = self._glb("/base", glb, frame)
-            self._base_lines = self._wires("/base_wires", soup.vertices, soup.faces)
+            self._set_wires("base", soup.vertices, soup.faces)
             self.apply_visibility()
 
     def picking(self, wanted: bool) -> None:
@@ -76,12 +81,12 @@ class Canvas:
         else:
             self._base.remove_click_callback("all")
 
-    def show_regions(self, poses: Iterable[EllipsoidPose], meshes: Iterable[FocalRegion], frame: Normalisation) -> None:
+    def show_regions(self, poses: Sequence[EllipsoidPose], meshes: Sequence[FocalRegion], frame: Normalisation) -> None:
         """All regions as glass; the gizmo stays as it is."""
         with self.server.atomic():
             for handle in self._regions.values():
                 handle.remove()
-            self._regions = {}
+            self._regions, self._clickable = {}, set()
             for number, pose in enumerate(poses):
                 self._regions[pose.name] = handle = self._scene.add_icosphere(
                     f"/regions/{number}",
@@ -93,8 +98,8 @@ class Canvas:
                     cast_shadow=False,
                     receive_shadow=False,
                 )
-                handle.on_click(lambda event, name=pose.name: self._on_region(name))
                 self.place_region(pose, frame)
+            self._meshes = {region.name for region in meshes}
             for number, region in enumerate(meshes):
                 surface = region.surface()
                 self._regions[region.name] = self._scene.add_mesh_simple(
@@ -117,12 +122,13 @@ class Canvas:
 
     def show_gizmo(self, pose: EllipsoidPose | None, frame: Normalisation) -> None:
         """The gizmo of the region that is selected; None: none."""
+        self._let_click(None if pose is None else pose.name)
         if pose is None:
             if self._gizmo is not None:
                 self._gizmo.visible = False
             return
         if self._gizmo is None:
-            self._gizmo = self._scene.add_transform_controls("/gizmo", scale=0.42, depth_test=False)
+            self._gizmo = self._scene.add_transform_controls("/gizmo", scale=GIZMO_SCALE, depth_test=False)
 
             # `async`, so that poses are taken in the order in which they come.
             async def moved(event: Any) -> None:
@@ -132,26 +138,38 @@ class Canvas:
         self._gizmo.position, self._gizmo.wxyz = frame.to_canonical(np.array(pose.centre)), np.array(pose.wxyz)
         self._gizmo.visible = self.visible["regions"]
 
+    def _let_click(self, selected: str | None) -> None:
+        """Every ellipsoid but the selected one can be clicked: that one would take the clicks that are for its gizmo,
+        which lies within it."""
+        for name, handle in self._regions.items():
+            wanted = name != selected and name not in self._meshes
+            if wanted and name not in self._clickable:
+                handle.on_click(lambda event, name=name: self._on_region(name))
+                self._clickable.add(name)
+            elif not wanted and name in self._clickable:
+                handle.remove_click_callback("all")
+                self._clickable.remove(name)
+
     def show_part_mesh(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         """The part in clay: vertices (V, 3) canonical, faces (F, 3)."""
         with self.server.atomic():
             self._part = self._scene.add_mesh_simple("/part", vertices, faces, color=_PART, side="double")
-            self._part_lines = self._wires("/part_wires", vertices, faces)
+            self._set_wires("part", vertices, faces)
             self.apply_visibility()
 
     def show_part_glb(self, glb: bytes, frame: Normalisation, vertices: np.ndarray, faces: np.ndarray) -> None:
         """The part with its material, from a GLB in the user frame; its mesh again, canonical, for its wires."""
         with self.server.atomic():
             self._part = self._glb("/part", glb, frame)
-            self._part_lines = self._wires("/part_wires", vertices, faces)
+            self._set_wires("part", vertices, faces)
             self.apply_visibility()
 
     def show_no_part(self) -> None:
         """Nothing but the base."""
-        for handle in (self._part, self._part_lines):
-            if handle is not None:
-                handle.remove()
-        self._part = self._part_lines = None
+        if self._part is not None:
+            self._part.remove()
+            self._part = None
+        self._set_wires("part", np.zeros((0, 3)), np.zeros((0, 3)))
 
     @property
     def _glass(self) -> float:
@@ -161,14 +179,17 @@ class Canvas:
         """Show what `visible` says; regions are faint where a part is to be seen in them."""
         shown = self.visible
         self._grid.visible = shown["grid"]
-        for handle, solid, wires in (
-            (self._base, shown["base"] and not self.base_hidden, False),
-            (self._part, shown["part"], False),
-            (self._base_lines, shown["base"], True),
-            (self._part_lines, shown["part"], True),
-        ):
+        solid = {"base": shown["base"] and not self.base_hidden, "part": shown["part"]}
+        for name, handle in (("base", self._base), ("part", self._part)):
             if handle is not None:
-                handle.visible = solid and (shown["wireframe"] or not wires)
+                handle.visible = solid[name]
+        for name, (vertices, faces, lines) in list(self._wires.items()):
+            wanted = solid[name] and shown["wireframe"]
+            if wanted and lines is None and len(faces):
+                lines = self._scene.add_mesh_simple(f"/{name}_wires", vertices, faces, color=_LINES, wireframe=True)
+                self._wires[name] = vertices, faces, lines
+            if lines is not None:
+                lines.visible = wanted
         for handle in self._regions.values():
             handle.visible, handle.opacity = shown["regions"], self._glass
         if self._gizmo is not None:
@@ -177,8 +198,12 @@ class Canvas:
     def _glb(self, name: str, glb: bytes, frame: Normalisation) -> Any:
         return self._scene.add_glb(name, glb, scale=frame.scale, position=-frame.scale * frame.centre)
 
-    def _wires(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-        return self._scene.add_mesh_simple(name, vertices, faces, color=_LINES, wireframe=True, visible=False)
+    def _set_wires(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Lines of another mesh, which are only sent when they are wanted."""
+        before = self._wires.get(name)
+        if before is not None and before[2] is not None:
+            before[2].remove()
+        self._wires[name] = vertices, faces, None
 
 
 def region_colour(number: int) -> tuple[int, int, int]:

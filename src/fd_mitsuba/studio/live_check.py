@@ -39,6 +39,8 @@ class LiveCheck:
 
 def live_check(scene: EditScene, config: RunConfig) -> LiveCheck:
     """The check of a scene whose regions or prompt a person has changed. Takes about a second; raises nothing."""
+    if not scene.prompt:
+        return LiveCheck("the prompt is blank; describe the edited object")
     refusal = _misplaced(scene)
     try:
         report = check_scene(scene, config)

@@ -12,7 +12,8 @@ def live_part(stage: GeometryStage) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 in the user frame and faces (F, 3) int64 of the part as it is now.
 
     The part's side of the union with the base: open where it joins the base, which the page shows itself. Nothing of
-    the stage is changed, no random number is drawn. Takes about as long as a tenth of a step.
+    the stage is changed, no random number is drawn. It takes a twentieth of a step's
+    processor time.
     """
     with torch.no_grad():
         surface = stage.surface()

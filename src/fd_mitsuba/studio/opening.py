@@ -18,12 +18,13 @@ class Opened:
     work: the work folder.
     scene: to start from; None: the work folder has its own.
     shown: name of the run to show first; "": the newest.
-    parameters: the scene's `-D` values.
+    run: a run from elsewhere to show; None: none.
     """
 
     work: WorkFolder
     scene: EditScene | None
     shown: str = ""
+    run: Path | None = None
 
 
 def open_target(
@@ -66,7 +67,7 @@ def _run(folder: Path, output: Path | None, say: Callable[[str], None]) -> Opene
             "the scene"
         )
     name = (read_json_object(folder / "run.json") or {}).get("scene_name") or folder.name
-    return Opened(WorkFolder(output or folder.parent / f"studio_{name}"), scene)
+    return Opened(WorkFolder(output or folder.parent / f"studio_{name}"), scene, folder.name, folder)
 
 
 def _name(scene: Path) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from fd_mitsuba.conventions import BASE_LONGEST_SIDE
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.results import FORMATS
@@ -66,18 +67,20 @@ class Panel:
         return self._heard(lambda event: self._actions[action](event))
 
     def _prompt(self) -> None:
-        self.prompt = self._gui.add_text("Prompt", self.session.prompt, hint="what the edited object shall look like")
+        self.prompt = self._gui.add_text(
+            "Prompt", self.session.state.prompt, hint="what the edited object shall look like"
+        )
         self.prompt.on_update(self._heard(lambda event: self.session.set_prompt(event.target.value)))
         self.reading = self._gui.add_markdown("")
 
     def _region(self) -> None:
-        session = self.session
-        names = list(session.regions.poses) or ["-"]
-        self.region = self._gui.add_dropdown("Region", names, initial_value=session.selected or names[0])
+        session, state = self.session, self.session.state
+        names = list(state.regions.poses) or ["-"]
+        self.region = self._gui.add_dropdown("Region", names, initial_value=state.selected or names[0])
         self.region.on_update(self._heard(lambda event: session.select(event.target.value)))
         self.part = self._gui.add_text("Part", "part", hint="regions of one part grow together")
         self.centre = self._gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=1e-3)
-        longest = 1.8 / session.scene.frame.scale
+        longest = BASE_LONGEST_SIDE / state.scene.frame.scale
         self.radii = [
             self._gui.add_slider(
                 f"Radius {axis}", _even(longest / 200), _even(longest * 0.6), longest / 1e4, longest / 10
@@ -94,7 +97,8 @@ class Panel:
 
     def _field_changed(self) -> None:
         with self.session.lock:
-            pose = self.session.regions.pose(self.session.selected)
+            state = self.session.state
+            pose = state.regions.pose(state.selected)
             centre = tuple(
                 old if abs(old - new) < 5e-4 else new for old, new in zip(pose.centre, self.centre.value, strict=True)
             )  # the field shows three digits: what it did not change keeps all of its own
@@ -103,10 +107,10 @@ class Panel:
                 abs(old - new) <= slider.step for old, new, slider in zip(pose.radii, radii, self.radii, strict=True)
             )
             radii = pose.radii if same else radii
-            self.session.put(replace(pose, part=self.part.value.strip(), centre=centre, radii=radii))
+            self.session.put(replace(pose, part=self.part.value.strip() or pose.part, centre=centre, radii=radii))
 
     def _run(self) -> None:
-        settings = self.session.settings
+        settings = self.session.state.settings
         presets = list(dict.fromkeys([settings.preset, *PRESETS]))
         self.preset = self._gui.add_dropdown("Settings", presets, initial_value=settings.preset)
         self.seed = self._gui.add_number("Seed", settings.seed, min=0, max=2**31 - 1, step=1)
@@ -136,13 +140,13 @@ class Panel:
 
     def show_regions(self) -> None:
         """Names and the selected region's numbers."""
-        session = self.session
-        names = list(session.regions.poses) or ["-"]
+        state = self.session.state
+        names = list(state.regions.poses) or ["-"]
         if tuple(names) != tuple(self.region.options):
             self.region.options = names
-        self.region.value = session.selected or names[0]
-        if session.selected:
-            self.show_pose(session.regions.poses[session.selected])
+        self.region.value = state.selected or names[0]
+        if state.selected:
+            self.show_pose(state.regions.poses[state.selected])
 
     def show_pose(self, pose: EllipsoidPose) -> None:
         """The numbers of the selected region."""
@@ -154,12 +158,13 @@ class Panel:
             slider.value = max(radius, slider.min)
 
     def show_prompt(self) -> None:
-        """The prompt as the session has it."""
-        self.prompt.value = self.session.prompt
+        """The prompt as the session has it; blanks that a person is typing stay."""
+        if " ".join(self.prompt.value.split()) != self.session.state.prompt:
+            self.prompt.value = self.session.state.prompt
 
     def show_settings(self) -> None:
         """Preset, seed, steps."""
-        settings = self.session.settings
+        settings = self.session.state.settings
         self.preset.value, self.seed.value, self.steps.value = settings.preset, settings.seed, settings.steps
 
     def show_check(self, check: LiveCheck) -> None:

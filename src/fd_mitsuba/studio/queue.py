@@ -13,6 +13,7 @@ from pathlib import Path
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run_folder import LIVE_FOLDER
+from fd_mitsuba.studio.adopted_run import adopt
 from fd_mitsuba.studio.job import RunOrder
 from fd_mitsuba.studio.run_state import (
     FAILED,
@@ -51,6 +52,7 @@ class RunQueue:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.runs: dict[str, RunState] = {}
+        self.adopted: list[Path] = []
         for path in sorted(folder.glob("*")) if folder.is_dir() else []:
             if (path / LIVE_FOLDER / "job.json").is_file():
                 with contextlib.suppress(UserError):
@@ -108,6 +110,14 @@ class RunQueue:
                 self._process.send_signal(signal.SIGINT if run.state != STOPPING else signal.SIGKILL)
                 run.state = STOPPING
         self._changed(name)
+
+    def adopt(self, folder: Path) -> None:
+        """Take in a run that was made elsewhere; UserError where it cannot be gone on with."""
+        if folder.name in self.runs:
+            return
+        adopt(folder)
+        self._know(folder).settled()
+        self.adopted.append(folder)
 
     @property
     def current(self) -> RunState | None:

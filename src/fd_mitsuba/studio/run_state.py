@@ -9,6 +9,7 @@ from typing import Any
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.runs.run_folder import LIVE_FOLDER
 from fd_mitsuba.studio.job import MESH_NAME, EventReader
+from fd_mitsuba.training.record import read_metrics
 
 QUEUED, STARTING, RUNNING, STOPPING, STOPPED, FINISHED, FAILED = (
     "queued", "starting", "running", "stopping", "stopped", "finished", "failed",
@@ -71,12 +72,20 @@ class RunState:
 
     def settled(self) -> RunState:
         """The state of a run that no process works on: what its files say."""
-        self.follow()
+        if not self.follow():
+            self._take_metrics()
         if self.finished_on_disk:
             self.state = FINISHED
         elif self.state != FAILED:
             self.state = STOPPED
         return self
+
+    def _take_metrics(self) -> None:
+        """Where a run stands that was not started here: from its own record."""
+        rows, config = read_metrics(self.folder / "metrics.jsonl"), read_json_object(self.folder / "config.json") or {}
+        if rows:
+            steps = (config.get(str(rows[-1].get("stage"))) or {}).get("steps")
+            self._take({**rows[-1], "event": "step", "total": steps})
 
     def _take(self, row: dict[str, Any]) -> None:
         event = row["event"]

@@ -31,12 +31,12 @@ class View:
         self._whole = False
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
         actions: dict[str, Callable[[Any], None]] = {
-            "mirror": lambda event: session.mirror(session.selected, AXES[self.panel.axis.value]) and None,
+            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]) and None,
             "pick": lambda event: self.canvas.picking(True),
             "add": lambda event: session.add() and None,
-            "remove": lambda event: session.remove(session.selected),
-            "grow": lambda event: session.grow() and None,
-            "another_seed": lambda event: session.another_seed() and None,
+            "remove": lambda event: session.remove(session.state.selected),
+            "grow": lambda event: self._grow(session.grow),
+            "another_seed": lambda event: self._grow(session.another_seed),
             "save": lambda event: self._note(event, session.save_scene()),
             "show": lambda event: session.show(self.panel.run_of(event.target.value)),
             "stop": lambda event: session.queue.stop(session.shown),
@@ -60,13 +60,13 @@ class View:
 
     def _refresh(self, topic: str) -> None:
         session, panel, canvas = self.session, self.panel, self.canvas
-        with session.lock:
-            pose, frame = session.regions.poses.get(session.selected), session.scene.frame
-            poses, meshes = list(session.regions.poses.values()), list(session.regions.meshes.values())
+        state = session.state
+        pose, frame = state.regions.poses.get(state.selected), state.scene.frame
+        poses, meshes = list(state.regions.poses.values()), list(state.regions.meshes.values())
         if topic == "scene":
             canvas.show_no_part()
             self._part_key = ""
-            canvas.show_base(session.base_glb, frame, session.scene.base_canonical)
+            canvas.show_base(state.glb, frame, state.scene.base_canonical)
         if topic in ("scene", "regions"):
             canvas.show_regions(poses, meshes, frame)
         if topic in ("scene", "regions", "selected"):
@@ -91,7 +91,7 @@ class View:
         key = "" if run is None else shown_key(run)
         if key == self._part_key:
             return
-        frame = self.session.scene.frame
+        frame = self.session.state.scene.frame
         part = None if run is None else shown_part(run, frame)
         self._part_key, self._whole = key, part is not None and part.whole
         if part is None or not len(part.faces):
@@ -120,6 +120,13 @@ class View:
 
         return call
 
+    def _grow(self, begin: Callable[[], str]) -> None:
+        self.panel.grow.disabled = True  # the check takes a moment, in which nobody shall ask twice
+        try:
+            begin()
+        finally:
+            self.panel.grow.disabled = False
+
     def _again(self) -> None:
         """Fields that hold what was refused go back to what is."""
         for topic in ("selected", "prompt", "settings", "runs"):
@@ -138,9 +145,10 @@ class View:
     def _gizmo_moved(self, position: np.ndarray, wxyz: np.ndarray) -> None:
         session = self.session
         with session.lock:
-            pose = session.regions.poses.get(session.selected)
+            state = session.state
+            pose = state.regions.poses.get(state.selected)
             if pose is not None:
-                session.put(pose.moved(session.scene.frame.to_user(position), wxyz))
+                session.put(pose.moved(state.scene.frame.to_user(position), wxyz))
 
     def _visibility(self, event: Any) -> None:
         with self._lock:

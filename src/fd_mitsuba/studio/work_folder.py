@@ -62,6 +62,12 @@ class WorkFolder:
             raise UserError(f"{self.record}: is damaged or of another version; choose another -o folder")
         return data
 
+    def adopted(self) -> list[Path]:
+        """Run folders from elsewhere that the record names, as far as they are still there."""
+        named = (read_json_object(self.record) or {}).get("adopted")
+        found = [self.path / str(place) for place in named] if isinstance(named, list) else []
+        return [folder for folder in found if (folder / "run.json").is_file()]
+
     def write(self, data: dict[str, Any]) -> None:
         """Replace the record; UserError where the folder cannot be written."""
         write_json(self.record, {"version": VERSION, **data})
