@@ -32,6 +32,7 @@ from fd_mitsuba.cli.preview import add_preview_command
 from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
 from fd_mitsuba.cli.run import add_run_command
+from fd_mitsuba.cli.studio import add_studio_command
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError, out_of_memory, printable
 
 _LONGEST_USAGE = 300
@@ -117,6 +118,7 @@ def command_parser() -> argparse.ArgumentParser:
         add_run_command,
         add_check_command,
         add_preview_command,
+        add_studio_command,
         add_export_commands,
         add_batch_commands,
         add_report_commands,

@@ -31,6 +31,8 @@ _FILES = (_SETTINGS_NAME, "environment.json", "command.txt", "metrics.jsonl", "r
 _FOLDERS = ("scene", "images", "checkpoints")
 TRIES_FOLDER, TRIES_RECORD = "tries", "tries.json"
 """What lies in a run folder before the run itself where several seeds are tried."""
+LIVE_FOLDER = "live"
+"""What lies there before the run where it was started from the studio: its order, and what it tells of itself."""
 
 
 def check_folder(scene: EditScene, config: RunConfig, folder: Path, resume: bool) -> list[str]:
@@ -57,7 +59,7 @@ def refuse_strange_folder(folder: Path) -> None:
     """UserError for a file, and for a folder that is neither empty nor a run's."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; choose another -o folder")
-    before = (LOCK_NAME, TRIES_FOLDER, TRIES_RECORD)
+    before = (LOCK_NAME, TRIES_FOLDER, TRIES_RECORD, LIVE_FOLDER)
     if not folder.exists() or all(is_litter(path) or path.name in before for path in folder.iterdir()):
         return
     if not (folder / _IDENTITY_NAME).exists():

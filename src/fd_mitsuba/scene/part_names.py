@@ -29,10 +29,15 @@ def part_names(elements: list[SceneElement], earlier: tuple[StackedPart, ...]) -
     for element, name in zip(elements, given, strict=True):
         if name is None:
             continue
-        if not isinstance(name, str) or not _PART_NAME.fullmatch(name) or name.endswith(".") or name == BASE_NAME:
+        if not isinstance(name, str) or not is_part_name(name):
             raise element.error(
                 f"part {name!r} cannot name a file; use letters, digits, '_' and '-', and not {BASE_NAME!r}"
             )
         if name.lower() in {other.lower() for other in taken}:
             raise element.error(f"part {name!r} is there from an earlier round; name it {free_name(name, taken)!r}")
     return [default if name is None else name for name in given]
+
+
+def is_part_name(name: str) -> bool:
+    """Whether a part can be called so: files and nodes take its name."""
+    return bool(_PART_NAME.fullmatch(name)) and not name.endswith(".") and name != BASE_NAME

@@ -1,0 +1,224 @@
+"""The 3D side of the page: base, regions with their gizmo, the growing part, the result. All in the canonical frame.
+
+In that frame every base is about two units long, so that gizmo, camera and grid need no scale of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
+
+if TYPE_CHECKING:
+    import viser
+
+CAMERA, FOV_DEG = (2.3, 1.6, 3.75), 40.0
+"""Where a tab looks from at first, towards the origin: it sees the whole cube."""
+GIZMO_SCALE = 0.42
+_COLOURS = [(242, 142, 43), (78, 121, 167), (89, 161, 79), (176, 122, 161), (225, 87, 89), (118, 183, 178)]
+_PART = (226, 178, 66)
+_LINES = (60, 60, 60)
+_GLASS, _FAINT_GLASS = 0.35, 0.1
+"""Opacity of a region, and of one whose part is shown."""
+
+
+class Canvas:
+    """Draws; knows nothing of runs or prompts. Every method replaces what was there before.
+
+    Args:
+        server: viser's.
+        on_region: hears the name of a region that was clicked.
+        on_gizmo: hears the gizmo's position and quaternion while it is dragged, canonical frame.
+        on_base: hears origin and direction of a click on the base while `picking`.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        on_region: Callable[[str], None],
+        on_gizmo: Callable[[np.ndarray, np.ndarray], None],
+        on_base: Callable[[Any], None],
+    ) -> None:
+        self.server, self._scene = server, server.scene
+        self._on_region, self._on_gizmo, self._on_base = on_region, on_gizmo, on_base
+        self._regions: dict[str, Any] = {}
+        self._clickable: set[str] = set()
+        self._meshes: set[str] = set()
+        self._gizmo: Any = None
+        self._base: Any = None
+        self._part: Any = None
+        self._wires: dict[str, tuple[np.ndarray, np.ndarray, Any]] = {}
+        """`base` and `part` -> vertices, faces, and the lines once somebody wanted to see them."""
+        self.base_hidden = False
+        """Whether the part's GLB has the base in it."""
+        self.visible = {"base": True, "part": True, "regions": True, "wireframe": False, "grid": True}
+        self._scene.set_up_direction("+y")
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.up = CAMERA, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+        camera.fov = float(np.radians(FOV_DEG))
+        self._grid = self._scene.add_line_segments("/grid", _box_edges(GRID_HALF_EXTENT), _LINES, line_width=1.0)
+
+    def show_base(self, glb: bytes, frame: Normalisation, soup: TriangleMesh) -> None:
+        """The base, from a GLB in the user frame; `soup` is the same in the canonical frame, for its wires."""
+        with self.server.atomic():
+            self._base = self._glb("/base", glb, frame)
+            self._set_wires("base", soup.vertices, soup.faces)
+            self.apply_visibility()
+
+    def picking(self, wanted: bool) -> None:
+        """Whether a click on the base is heard."""
+        if self._base is None:
+            return
+        if wanted:
+            self._base.on_click(lambda event: self._on_base(event))
+        else:
+            self._base.remove_click_callback("all")
+
+    def show_regions(self, poses: Sequence[EllipsoidPose], meshes: Sequence[FocalRegion], frame: Normalisation) -> None:
+        """All regions as glass; the gizmo stays as it is."""
+        with self.server.atomic():
+            for handle in self._regions.values():
+                handle.remove()
+            self._regions, self._clickable = {}, set()
+            for number, pose in enumerate(poses):
+                self._regions[pose.name] = handle = self._scene.add_icosphere(
+                    f"/regions/{number}",
+                    radius=1.0,
+                    subdivisions=3,
+                    color=region_colour(number),
+                    opacity=self._glass,
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                self.place_region(pose, frame)
+            self._meshes = {region.name for region in meshes}
+            for number, region in enumerate(meshes):
+                surface = region.surface()
+                self._regions[region.name] = self._scene.add_mesh_simple(
+                    f"/region_meshes/{number}",
+                    surface.vertices,
+                    surface.faces,
+                    color=(150, 150, 150),
+                    opacity=0.35,
+                    side="double",
+                )
+            self.apply_visibility()
+
+    def place_region(self, pose: EllipsoidPose, frame: Normalisation) -> None:
+        """Put one ellipsoid where it is now."""
+        handle = self._regions.get(pose.name)
+        if handle is None:
+            return
+        handle.position, handle.wxyz = frame.to_canonical(np.array(pose.centre)), np.array(pose.wxyz)
+        handle.scale = tuple(frame.scale * radius for radius in pose.radii)
+
+    def show_gizmo(self, pose: EllipsoidPose | None, frame: Normalisation) -> None:
+        """The gizmo of the region that is selected; None: none."""
+        self._let_click(None if pose is None else pose.name)
+        if pose is None:
+            if self._gizmo is not None:
+                self._gizmo.visible = False
+            return
+        if self._gizmo is None:
+            self._gizmo = self._scene.add_transform_controls("/gizmo", scale=GIZMO_SCALE, depth_test=False)
+
+            # `async`, so that poses are taken in the order in which they come.
+            async def moved(event: Any) -> None:
+                self._on_gizmo(np.array(event.target.position), np.array(event.target.wxyz))
+
+            self._gizmo.on_update(moved)
+        self._gizmo.position, self._gizmo.wxyz = frame.to_canonical(np.array(pose.centre)), np.array(pose.wxyz)
+        self._gizmo.visible = self.visible["regions"]
+
+    def _let_click(self, selected: str | None) -> None:
+        """Every ellipsoid but the selected one can be clicked: that one would take the clicks that are for its gizmo,
+        which lies within it."""
+        for name, handle in self._regions.items():
+            wanted = name != selected and name not in self._meshes
+            if wanted and name not in self._clickable:
+                handle.on_click(lambda event, name=name: self._on_region(name))
+                self._clickable.add(name)
+            elif not wanted and name in self._clickable:
+                handle.remove_click_callback("all")
+                self._clickable.remove(name)
+
+    def show_part_mesh(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """The part in clay: vertices (V, 3) canonical, faces (F, 3)."""
+        with self.server.atomic():
+            self._part = self._scene.add_mesh_simple("/part", vertices, faces, color=_PART, side="double")
+            self._set_wires("part", vertices, faces)
+            self.apply_visibility()
+
+    def show_part_glb(self, glb: bytes, frame: Normalisation, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """The part with its material, from a GLB in the user frame; its mesh again, canonical, for its wires."""
+        with self.server.atomic():
+            self._part = self._glb("/part", glb, frame)
+            self._set_wires("part", vertices, faces)
+            self.apply_visibility()
+
+    def show_no_part(self) -> None:
+        """Nothing but the base."""
+        if self._part is not None:
+            self._part.remove()
+            self._part = None
+        self._set_wires("part", np.zeros((0, 3)), np.zeros((0, 3)))
+
+    @property
+    def _glass(self) -> float:
+        return _GLASS if self._part is None else _FAINT_GLASS
+
+    def apply_visibility(self) -> None:
+        """Show what `visible` says; regions are faint where a part is to be seen in them."""
+        shown = self.visible
+        self._grid.visible = shown["grid"]
+        solid = {"base": shown["base"] and not self.base_hidden, "part": shown["part"]}
+        for name, handle in (("base", self._base), ("part", self._part)):
+            if handle is not None:
+                handle.visible = solid[name]
+        for name, (vertices, faces, lines) in list(self._wires.items()):
+            wanted = solid[name] and shown["wireframe"]
+            if wanted and lines is None and len(faces):
+                lines = self._scene.add_mesh_simple(f"/{name}_wires", vertices, faces, color=_LINES, wireframe=True)
+                self._wires[name] = vertices, faces, lines
+            if lines is not None:
+                lines.visible = wanted
+        for handle in self._regions.values():
+            handle.visible, handle.opacity = shown["regions"], self._glass
+        if self._gizmo is not None:
+            self._gizmo.visible = shown["regions"]
+
+    def _glb(self, name: str, glb: bytes, frame: Normalisation) -> Any:
+        return self._scene.add_glb(name, glb, scale=frame.scale, position=-frame.scale * frame.centre)
+
+    def _set_wires(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Lines of another mesh, which are only sent when they are wanted."""
+        before = self._wires.get(name)
+        if before is not None and before[2] is not None:
+            before[2].remove()
+        self._wires[name] = vertices, faces, None
+
+
+def region_colour(number: int) -> tuple[int, int, int]:
+    """A colour for the region of that number, sRGB of 0 to 255."""
+    return _COLOURS[number % len(_COLOURS)]
+
+
+def _box_edges(half: float) -> np.ndarray:
+    """(12, 2, 3) the edges of a cube around the origin."""
+    edges = []
+    for axis in range(3):
+        for a in (-half, half):
+            for b in (-half, half):
+                ends = np.full((2, 3), 0.0)
+                ends[:, axis] = (-half, half)
+                ends[:, (axis + 1) % 3], ends[:, (axis + 2) % 3] = a, b
+                edges.append(ends)
+    return np.array(edges)

@@ -1,0 +1,136 @@
+"""What a person edits: the scene that was opened, its regions, the prompt, the settings; kept in the work folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.atomic import write_atomically
+from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.studio.base_glb import base_glb
+from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
+from fd_mitsuba.studio.opening import Opened
+from fd_mitsuba.studio.region_list import RegionList
+from fd_mitsuba.studio.run_state import RunState
+from fd_mitsuba.studio.scene_patch import patched
+from fd_mitsuba.studio.scene_source import SceneSource
+from fd_mitsuba.studio.settings import StudioSettings
+
+
+@dataclass
+class EditState:
+    """Attributes:
+    source: where the scene is.
+    scene: as its file has it; regions and prompt are those of this object.
+    glb: the base as the page shows it, user frame.
+    regions, prompt, settings: as they are now; a prompt may be blank.
+    selected: name of the ellipsoid that gizmo and fields are for, "" for none.
+    saved: the ellipsoids as the scene's file has them.
+    """
+
+    source: SceneSource
+    scene: EditScene
+    glb: bytes
+    regions: RegionList
+    prompt: str
+    settings: StudioSettings
+    selected: str = ""
+    saved: list[EllipsoidPose] = field(default_factory=list)
+
+    @classmethod
+    def open(cls, opened: Opened, settings: StudioSettings, say: Callable[[str], None]) -> EditState:
+        """What the work folder holds, or a new one's beginning; UserError where it or its scene cannot be read."""
+        record = opened.work.read()
+        source = SceneSource.opened(opened, record, say)
+        known = (record or {}).get("prompt")
+        prompt = (
+            opened.scene.prompt if opened.scene is not None else known if isinstance(known, str) and known else None
+        )
+        state = cls._of_source(source, prompt, settings)
+        if record is not None and not source.renewed:
+            state._restore(record, say)
+        return state
+
+    @classmethod
+    def _of_source(cls, source: SceneSource, prompt: str | None, settings: StudioSettings) -> EditState:
+        scene = source.load(prompt)
+        regions = RegionList.of_scene(scene)
+        saved, first = list(regions.poses.values()), next(iter(regions.poses), "")
+        return cls(source, scene, base_glb(scene), regions, scene.prompt, settings, first, saved)
+
+    def edited_scene(self) -> EditScene:
+        """The scene with the regions and the prompt as they are now."""
+        return replace(self.scene, regions=self.regions.focal_regions(), prompt=self.prompt)
+
+    def scene_text(self, text: bytes) -> bytes:
+        """A scene file that has the regions of `saved`, with those and the prompt of now."""
+        regions = list(self.regions.poses.values())
+        return patched(text, self.source.described, regions, self.saved, list(self.regions.meshes), self.prompt)
+
+    def save_scene(self) -> str:
+        """Write regions and prompt into the scene that was opened; a line that says what was done.
+
+        Raises:
+            UserError: the prompt is blank; the file's regions were changed meanwhile; the result could not be edited.
+        """
+        if not self.prompt:
+            raise UserError("the prompt is blank; describe the edited object, then save")
+        source, regions, prompt = self.source, list(self.regions.poses.values()), self.prompt
+        before = source.original.read_bytes()
+        after = self.scene_text(before)
+        if after == before:
+            return f"{source.described} has all that already"
+        write_atomically(source.original, after)
+        try:
+            scene = load_edit_scene(source.original, source.parameters, None, prompt)
+            found = RegionList.of_scene(scene).poses
+            if set(found) != {pose.name for pose in regions} or not all(found[p.name].lies_on(p) for p in regions):
+                raise UserError(f"{source.original}: its regions were changed since it was opened here; open it again")
+        except UserError:
+            write_atomically(source.original, before)
+            raise
+        source.renew(scene)
+        self.saved = regions
+        return f"saved in {source.described}"
+
+    def next_round(self, run: RunState) -> EditState:
+        """The state with the result of a run as its base, and the same regions and prompt for a start.
+
+        Raises:
+            UserError: the run has no result.
+        """
+        if not (run.folder / "export" / "mitsuba" / "scene.xml").is_file():
+            raise UserError(f"run {run.name}: has no result yet; let it finish first")
+        regions, prompt = list(self.regions.poses.values()), self.prompt or run.prompt
+        return self._of_source(self.source.next_round(run.folder, regions, prompt, run.prompt), None, self.settings)
+
+    def write(self, adopted: list[str]) -> None:
+        """Replace the work folder's record; `adopted` are run folders from elsewhere."""
+        self.source.work.write(
+            {
+                **self.source.to_json(),
+                "prompt": self.prompt,
+                "regions": [pose.to_json() for pose in self.regions.poses.values()],
+                "meshes": list(self.regions.meshes),
+                "selected": self.selected,
+                "settings": self.settings.to_json(),
+                "adopted": adopted,
+            }
+        )
+
+    def _restore(self, record: dict[str, Any], say: Callable[[str], None]) -> None:
+        """What the record says, as far as it can be read: a damaged entry leaves the scene's own."""
+        try:
+            kept = StudioSettings.of_json(record["settings"])
+            # What the command line says now counts more than what it said then.
+            overrides = self.settings.overrides
+            self.settings = replace(kept, overrides=overrides) if overrides else kept
+            self.prompt = str(record["prompt"])
+            self.regions.restore(record["regions"], record["meshes"])
+            self.selected = next(iter(self.regions.poses), "")
+            if record.get("selected") in self.regions.poses:
+                self.selected = record["selected"]
+        except (KeyError, TypeError, ValueError):
+            say(f"{self.source.work.record}: is damaged in part; regions and prompt are taken from the scene")

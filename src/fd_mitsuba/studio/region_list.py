@@ -1,0 +1,138 @@
+"""The regions that a person edits: ellipsoids in the user frame, and meshes that stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.part_names import is_part_name
+from fd_mitsuba.scene.part_stack import free_name
+from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to
+from fd_mitsuba.studio.picking import Hit
+
+NEW_RADIUS = 0.22
+"""Of a new region, canonical units: about what a hat for the base's head takes."""
+_SUNK = 0.25
+"""How deep a new region reaches into the base, in radii."""
+_MOST_REGIONS = 32
+
+
+@dataclass
+class RegionList:
+    """Attributes:
+    frame: of the base.
+    poses: the ellipsoids by name, in the scene's order.
+    meshes: regions that are no ellipsoids: shown, kept, and not to be changed here.
+    taken: names of parts of earlier rounds.
+    """
+
+    frame: Normalisation
+    poses: dict[str, EllipsoidPose] = field(default_factory=dict)
+    meshes: dict[str, FocalRegion] = field(default_factory=dict)
+    taken: tuple[str, ...] = ()
+
+    @classmethod
+    def of_scene(cls, scene: EditScene) -> RegionList:
+        """The regions as the scene has them."""
+        taken = tuple(name for part in scene.earlier for name in (part.name, part.shape))
+        found = cls(scene.frame, taken=taken)
+        back = np.linalg.inv(scene.frame.matrix())
+        for region in scene.regions:
+            if region.is_ellipsoid:
+                matrix = back @ region.to_canonical
+                found.poses[region.name] = EllipsoidPose.of_matrix(region.name, matrix, region.part, region.mode)
+            else:
+                found.meshes[region.name] = region
+        return found
+
+    @property
+    def names(self) -> list[str]:
+        """Of all regions, ellipsoids first."""
+        return [*self.poses, *self.meshes]
+
+    def focal_regions(self) -> tuple[FocalRegion, ...]:
+        """As `EditScene` has them."""
+        matrix = self.frame.matrix()
+        ellipsoids = [FocalRegion(p.name, matrix @ p.matrix, p.part, None, p.mode) for p in self.poses.values()]
+        return (*ellipsoids, *self.meshes.values())
+
+    def pose(self, name: str) -> EllipsoidPose:
+        """The ellipsoid of that name; UserError for a mesh, or where there is none."""
+        if name in self.meshes:
+            raise UserError(f"region {name}: is a mesh; it can be changed in the scene file only")
+        if name not in self.poses:
+            raise UserError(f"region {name}: is not there any more")
+        return self.poses[name]
+
+    def put(self, pose: EllipsoidPose) -> None:
+        """Replace the ellipsoid of the same name.
+
+        Raises:
+            UserError: no such ellipsoid, a radius that is not positive, a part that cannot be called so.
+        """
+        self.pose(pose.name)
+        if min(pose.radii) <= 0:
+            raise UserError(f"region {pose.name}: a radius is not positive; enlarge it")
+        if not is_part_name(pose.part) or pose.part.lower() in {name.lower() for name in self.taken}:
+            raise UserError(
+                f"part {pose.part!r}: is taken by an earlier round, or cannot name a file; use letters, digits, "
+                "'_' and '-', and not 'base'"
+            )
+        self.poses[pose.name] = pose
+
+    def add(self, point: np.ndarray, normal: np.ndarray) -> EllipsoidPose:
+        """A new ball that reaches a little into the base at a point (3,) of its surface, canonical frame.
+
+        Its y axis is the surface's normal, so that the second radius is its height.
+        """
+        if len(self.names) >= _MOST_REGIONS:
+            raise UserError(f"there are {_MOST_REGIONS} regions already; remove some")
+        centre = self.frame.to_user(np.asarray(point) + (1 - _SUNK) * NEW_RADIUS * np.asarray(normal))
+        radius = NEW_RADIUS / self.frame.scale
+        like = next(iter(self.focal_regions()), None)
+        pose = EllipsoidPose(free_name("region", self.names), tuple(centre.tolist()), turned_to(normal), (radius,) * 3)
+        if like is not None:
+            pose = replace(pose, part=like.part, mode=like.mode)
+        self.poses[pose.name] = pose
+        return pose
+
+    def add_at(self, hit: Hit) -> EllipsoidPose:
+        """`add` where a ray has met the base."""
+        return self.add(hit.point, hit.normal)
+
+    def remove(self, name: str) -> None:
+        """Take an ellipsoid away; UserError for a mesh, or the last region."""
+        self.pose(name)
+        if len(self.names) == 1:
+            raise UserError("a scene needs a region; add another one first")
+        del self.poses[name]
+
+    def mirror(self, name: str, axis: int) -> EllipsoidPose:
+        """A copy on the other side of the base's middle, of the same part.
+
+        Raises:
+            UserError: the region lies on the middle, so that its image is itself.
+        """
+        pose = self.pose(name)
+        image = pose.mirrored(free_name(f"{name}_mirrored", self.names), axis, float(self.frame.centre[axis]))
+        if any(image.lies_on(other) for other in self.poses.values()):
+            where = "lies on the base's middle, so its image is itself"
+            if not image.lies_on(pose):
+                where = "has its mirror image already"
+            raise UserError(f"region {name}: {where}; move it aside, or mirror along another axis")
+        self.poses[image.name] = image
+        return image
+
+    def restore(self, rows: Sequence[object], kept: Collection[str]) -> None:
+        """The ellipsoids of a record in place of the scene's; ValueError, TypeError or KeyError for a damaged one."""
+        poses = [EllipsoidPose.of_json(dict(row)) for row in rows]  # type: ignore[call-overload]
+        names = [pose.name for pose in poses]
+        if not poses and not self.meshes or len(set(names)) < len(names) or set(kept) != set(self.meshes):
+            raise ValueError("the regions do not fit the scene")
+        self.poses = {pose.name: pose for pose in poses}
