@@ -34,7 +34,7 @@ llvm:
 demo: $(STAMP) llvm
 	@if [ -e "$(OUT)" ]; then mv "$(OUT)" "$(OUT).until-$$(date +%Y%m%d-%H%M%S)"; fi
 	$(PY) -m fd_mitsuba run $(SCENE) -c $(CONFIG) -o $(OUT)
-	@echo "look at $(OUT)/images/turntable.png (shape) and images/appearance.png (material); $(OUT)/export/asset.glb opens in Blender"
+	@echo "look at $(OUT)/images/appearance.png, or open $(OUT)/report.html; $(OUT)/export/asset.glb opens in Blender"
 
 test: $(STAMP) llvm
 	$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.viewing.turntable import write_sheet, write_video
@@ -54,7 +55,9 @@ def make_run(folder: Path, stages: tuple[str, ...] = ("geometry", "appearance"),
         write("metrics.json", metrics)
     if finished and "appearance" in stages:
         write_video(after, folder / "videos" / "appearance.mp4")
-        write_video(before, folder / "videos" / "appearance_base.mp4")
+        for name, frame in (("beauty_base", before[0]), ("beauty", after[0]), ("closeup", after[3])):
+            Image.fromarray(frame).save(folder / "images" / f"{name}.png")
+        write_sheet({name: shape[:8] for name in "abcd"}, folder / "images" / "channels.png")
         metrics["appearance"] = {"base_psnr_db": 200.0, "learned": ["base_color"]}
     if finished:
         write("metrics.json", {**metrics, "seconds": 47.5, "stages": dict.fromkeys(stages, "done")})

@@ -72,7 +72,13 @@ class Fuzzer:
             raise RuntimeError(f"the sound scene is refused: {outcome.errors}")
         if self.with_run:
             small = [
-                f"--set={item}" for item in ("geometry.spp=1", "output.turntable_size=32", "output.texture_size=16")
+                f"--set={item}"
+                for item in (
+                    "geometry.spp=1",
+                    "output.turntable_size=32",
+                    "output.picture_size=32",
+                    "output.texture_size=16",
+                )
             ]
             options = [
                 "-c",

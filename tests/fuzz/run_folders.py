@@ -36,7 +36,12 @@ def run_folder(rng: Random, folder: Path) -> list[str]:
         return ["export", str(run), "--format", rng.choice(["obj", "glb", "ply", "mitsuba"]), "--texture-size", "16"]
     if command == "resume":
         given = ["-c", str(folder / "settings.toml"), "-o", str(run), "--stage", "geometry", "--resume", "-q"]
-        small = ["--set=geometry.spp=1", "--set=output.turntable_size=32", "--set=output.texture_size=16"]
+        small = [
+            "--set=geometry.spp=1",
+            "--set=output.turntable_size=32",
+            "--set=output.picture_size=32",
+            "--set=output.texture_size=16",
+        ]
         return ["run", str(folder / "scene.xml"), *given, *small]
     if command == "instance":
         (folder / "places.json").write_bytes(

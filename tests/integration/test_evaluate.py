@@ -45,6 +45,7 @@ sheet_every = 0
 checkpoint_every = 2
 turntable_frames = 2
 turntable_size = 16
+picture_size = 16
 texture_size = 16
 """
 

@@ -46,6 +46,7 @@ sheet_every = 2
 checkpoint_every = 2
 turntable_frames = 2
 turntable_size = 32
+picture_size = 32
 texture_size = 32
 """
 SPEAKING_OF_TIME = {"seconds", "peak_memory_mb"}
@@ -152,7 +153,7 @@ def test_killed_at_40_random_moments_of_both_stages(place: Path, whole: tuple[di
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    "waited_for", ["images/appearance.png", pytest.param("export/part.json", marks=pytest.mark.slow)]
+    "waited_for", ["images/channels.png", pytest.param("export/part.json", marks=pytest.mark.slow)]
 )
 def test_interrupted_while_it_bakes_or_exports(place: Path, waited_for: str) -> None:
     """After the last step nobody is in a loop that could save: the files that are there are whole, the rest is made."""

@@ -39,7 +39,7 @@ def test_report(width: int, scheme: str, make_scene, textured_base: str, tmp_pat
     exported(load_edit_scene(make_scene(base=textured_base)), run / "export", Learned, size=64)
     found = opened(write_report(run), tmp_path / "page.png", width, scheme)
     assert found["materials"] == ["ball", "part_part"]
-    assert found["turned"] and found["cut"] == "50%" and found["shown"] == 2  # one pair of two, and the part
+    assert found["turned"] and found["cut"] == "50%" and found["shown"] == 1  # one pair of three
     pixels = np.asarray(Image.open(tmp_path / "page.png").convert("L")).astype(float)
     assert pixels.std() > 10 and (np.median(pixels) > 128) == (scheme == "light")
 

@@ -55,6 +55,7 @@ sheet_every = 3
 checkpoint_every = 4
 turntable_frames = 3
 turntable_size = 32
+picture_size = 32
 """
 STEPS = 6
 LONG = ("--set", "geometry.lambda_sds=0", "--set", "geometry.steps=100000", "--set", "output.checkpoint_every=7")

@@ -45,6 +45,7 @@ sheet_every = 2
 checkpoint_every = 2
 turntable_frames = 2
 turntable_size = 32
+picture_size = 32
 texture_size = 32
 """
 LIGHT = """<default name="level" value="1.0"/>
@@ -76,8 +77,9 @@ def finished(place: Path) -> Path:
 def test_pictures_and_assets_are_there(finished: Path) -> None:
     frames = imageio.imread(finished / "videos" / "appearance.mp4")
     assert frames.shape[1:] == (32, 32, 3)
-    with Image.open(finished / "images" / "appearance.png") as sheet:
-        assert np.asarray(sheet).std() > 10
+    for name, size in (("appearance", (48, 48)), ("channels", (256, 400)), ("beauty", (32, 32)), ("closeup", (32, 32))):
+        with Image.open(finished / "images" / f"{name}.png") as image:
+            assert image.size == size and np.asarray(image).std() > 10
     names = {path.name for path in (finished / "export").rglob("*") if path.is_file()}
     assert {"asset.glb", "scene.xml", "part_part.ply", "part_part_base_color.png", "animal.ply"} <= names
 

@@ -34,7 +34,7 @@ try {
   }
   const found = await page.evaluate(() => {
     const shown = [...document.querySelectorAll('.stage')].filter((stage) => stage.offsetHeight > 0).length;
-    const angle = document.querySelector(".angle"), layer = document.querySelector(".layer");
+    const angle = document.querySelector(".angle"), layer = [...document.querySelectorAll(".layer")].find((one) => one.dataset.count > 1);
     const before = layer?.style.backgroundPosition;
     if (angle) {
       angle.value = 700;

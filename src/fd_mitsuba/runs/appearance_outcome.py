@@ -37,10 +37,9 @@ from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, 
 from fd_mitsuba.training.step_views import check_views
 from fd_mitsuba.viewing.lit_views import VIEWS_AT_ONCE, lit_ring, ring_cameras
 from fd_mitsuba.viewing.sheets import map_rows
-from fd_mitsuba.viewing.turntable import write_sheet, write_video
+from fd_mitsuba.viewing.turntable import write_sheet
 
-_SHEET_VIEWS = 8
-_VIDEO_SPP, _SHEET_SPP = 12, 32
+_SHEET_VIEWS, _SHEET_SIZE, _SHEET_SPP = 8, 192, 12
 _BRIGHTEST_BOUNCE = 1.0
 """What a sample may see by way of another surface in the images of `render_run`, in units of the image's white."""
 CUTS_UNKNOWN = (
@@ -180,26 +179,15 @@ def finished_appearance(
 
 
 def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
-    """Write the lit turntable, before and after, and the maps; returns the measured metrics."""
+    """Write the maps of the material to `images/channels.png`; returns the measured metrics."""
     output, rendering = stage.config.output, stage.rendering
     alone = AppearancePass(stage.scene, {}, stage.shading, rendering.size, rendering.spp)
-    video = lit_turntable(stage, output.turntable_frames, output.turntable_size, _VIDEO_SPP)
-    write_video(video, folder / "videos" / "appearance.mp4")
-    around = ring_cameras(output.turntable_frames, stage.aim)
-    before = lit_ring(alone, alone.render_base, around, stage.exposure, output.turntable_size, _VIDEO_SPP)
-    write_video(before, folder / "videos" / "appearance_base.mp4")
-    cameras, size = ring_cameras(_SHEET_VIEWS, stage.aim), min(output.turntable_size, 192)
-    rows = {
-        "base": lit_ring(alone, alone.render_base, cameras, stage.exposure, size, _SHEET_SPP),
-        f"result: {stage.scene.prompt}": lit_turntable(stage, _SHEET_VIEWS, size, _SHEET_SPP),
-    }
+    cameras, size = ring_cameras(_SHEET_VIEWS, stage.aim), min(output.turntable_size, _SHEET_SIZE)
     with torch.no_grad():
-        gbuffer = rendering.trace(cameras, 0, size=size, spp=_VIDEO_SPP)
+        gbuffer = rendering.trace(cameras, 0, size=size, spp=_SHEET_SPP)
         texture = stage.texture(gbuffer)
         pictures = stage.render(gbuffer, texture, 0)
-    maps = map_rows(gbuffer, pictures, texture, stage.exposure)
-    del maps["merged"]  # at few samples; the result's own row has more
-    write_sheet({**rows, **maps}, folder / "images" / "appearance.png")
+    write_sheet(map_rows(gbuffer, pictures, texture, stage.exposure), folder / "images" / "channels.png")
     kept = measure_preservation(rendering, alone, cameras, stage.exposure, 128, 16, _removed(stage.scene, folder))
     return {
         **asdict(kept),

@@ -21,7 +21,7 @@ from fd_mitsuba.guidance.memory import available_bytes, held_bytes
 from fd_mitsuba.io.picture_size import picture_size
 from fd_mitsuba.render.geometry_pass import RAYS_AT_ONCE
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.viewing.lit_views import VIEWS_AT_ONCE
+from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
 
 _MIB = 2.0**20
 _IMPORTS, _BUILTIN = 390.0, 200.0
@@ -37,11 +37,10 @@ _PER_TABLE_BYTE = 10.0
 """A field's parameters, their gradients and moments, and the copies of a checkpoint."""
 _PER_SAMPLE, _PER_RAY, _PER_FRAME_PIXEL = 59.0, 85.0, 30.0
 _USUAL_FRAME_PIXELS = 48 * 256**2
-_USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, VIEWS_AT_ONCE * 256**2 * 12, 1024**2
+_USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, SAMPLES_AT_ONCE, 1024**2
 _TIGHT, _TOO_MUCH = 0.9, 1.25
 """Shares of what is left from which a run is warned of, and refused: the forecast is right to about 15 %."""
 _WORTH_NAMING = 0.25
-_VIDEO_SPP = 12  # as `appearance` has it
 
 
 @dataclass(frozen=True)
@@ -104,9 +103,9 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet
         settings, output = config.appearance, config.output
         side = settings.picture_size or (32 if config.guidance.model == "builtin" else 512)
         step = settings.views * side**2 * settings.spp
-        turn = VIEWS_AT_ONCE * output.turntable_size**2 * _VIDEO_SPP
-        name = "output.turntable_size" if turn >= step else "appearance.spp"
-        terms[name] = terms.get(name, 0.0) + _PER_SAMPLE * (max(turn, step) - _USUAL_SAMPLES) / _MIB
+        photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
+        name = "output.picture_size" if photograph >= step else "appearance.spp"
+        terms[name] = _PER_SAMPLE * (max(photograph, step) - _USUAL_SAMPLES) / _MIB
         terms["output.texture_size"] = _PER_TEXEL * (output.texture_size**2 - _USUAL_TEXELS) / _MIB
         terms["texture.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.texture) / _MIB
     return terms

@@ -45,6 +45,7 @@ from fd_mitsuba.runs.geometry_outcome import (
     take_geometry,
 )
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
+from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
@@ -190,6 +191,7 @@ def run(
         if with_assets:
             with rendering_threads():
                 write_assets(geometry, finished, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
+                write_photographs(scene, folder, config.output, say)
         metrics["warnings"] = outcome_warnings(metrics)
         # Written last of all: a folder without it is not finished.
         done = {"geometry", *stages}

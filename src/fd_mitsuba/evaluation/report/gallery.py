@@ -11,12 +11,12 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.report.metric_table import duration
-from fd_mitsuba.evaluation.report.run_page import PAGE, page_template, turntables
+from fd_mitsuba.evaluation.report.run_page import PAGE, page_template, photographs, shape_films
 from fd_mitsuba.evaluation.report.run_record import RunRecord, read_run
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.safe_text import quoted_link
-from fd_mitsuba.viewing.film_strip import Strip, common_crop, strip
+from fd_mitsuba.viewing.film_strip import Strip, common_crop, strip, video_frames
 
 _THUMB_FRAMES, _THUMB_SIZE = 12, 160
 _EVALUATED = ("sim", "dir", "dir_cosine", "rank", "rank_part", "valid")
@@ -39,6 +39,7 @@ class GalleryRow(NamedTuple):
     finished: bool
     before: Strip | None
     after: Strip | None
+    around: Strip | None
     cells: list[Cell]
 
 
@@ -131,27 +132,37 @@ def write_gallery(folders: Sequence[Path], path: Path, title: str = "Runs", say:
 def _row(run: RunRecord, columns: Sequence[_Column], root: Path) -> GalleryRow:
     report = run.folder / "report.html"
     link = quoted_link(Path(os.path.relpath(report.resolve(), root))) if report.is_file() else None
-    before, after = _thumbs(run.folder)
+    before, after, around = _thumbs(run.folder)
     values = [column.value(run) for column in columns]
     cells = [
         Cell(value, "-" if value is None else column.text(value)) for column, value in zip(columns, values, strict=True)
     ]
-    return GalleryRow(run.folder.resolve().name, link, run.prompt, run.state, run.finished, before, after, cells)
+    return GalleryRow(
+        run.folder.resolve().name, link, run.prompt, run.state, run.finished, before, after, around, cells
+    )
 
 
 def _bad_row(folder: Path, reason: str, columns: int) -> GalleryRow:
     reason = reason.removeprefix(f"{folder}: ")
-    return GalleryRow(folder.resolve().name, None, "", reason, False, None, None, [Cell(None, "-")] * columns)
+    return GalleryRow(folder.resolve().name, None, "", reason, False, None, None, None, [Cell(None, "-")] * columns)
 
 
-def _thumbs(folder: Path) -> tuple[Strip | None, Strip | None]:
-    found = turntables(folder)
-    if not found:
-        return None, None
-    _, _, before, after = found[0]
-    crop = common_crop(before, after)
-    chosen = np.linspace(0, len(after), min(_THUMB_FRAMES, len(after)), endpoint=False).astype(int)
-    return strip(before[chosen], crop, _THUMB_SIZE), strip(after[chosen], crop, _THUMB_SIZE)
+def _thumbs(folder: Path) -> tuple[Strip | None, Strip | None, Strip | None]:
+    """Before, after, and the object that turns in its light; the first two turn where there is no photograph."""
+    film = video_frames(folder / "videos" / "appearance.mp4")
+    around = None if film is None else strip(_some(film), None, _THUMB_SIZE)
+    if (found := photographs(folder)) is not None:
+        before, after = (strip(still, None, _THUMB_SIZE) for still in found)
+        return before, after, around
+    if (films := shape_films(folder)) is None:
+        return None, None, around
+    crop = common_crop(*films)
+    before, after = (strip(_some(frames), crop, _THUMB_SIZE) for frames in films)
+    return before, after, around
+
+
+def _some(frames: np.ndarray) -> np.ndarray:
+    return frames[np.linspace(0, len(frames), min(_THUMB_FRAMES, len(frames)), endpoint=False).astype(int)]
 
 
 def _means(columns: Sequence[_Column], rows: Sequence[GalleryRow]) -> list[Cell]:

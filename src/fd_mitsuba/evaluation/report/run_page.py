@@ -27,16 +27,34 @@ from fd_mitsuba.viewing.film_strip import Strip, common_crop, picture_uri, read_
 PAGE = Path(__file__).with_name("page")
 _MOST_GLB_BYTES = 9 << 20
 _STEPS_SHOWN = 6
-_SHEETS = {"appearance": "The material's maps", "turntable": "The shape, from eight sides"}
+_CLOSE_SIZE = 1024
+_SHEETS = {"turntable": "The shape, from eight sides"}
+_DOWNLOADS = {
+    "export/asset.glb": "GLB, for Blender, browsers and game engines",
+    "export/obj/asset.obj": "OBJ with its materials",
+    "export/mitsuba/scene.xml": "Mitsuba scene",
+    "export/assembled.ply": "PLY of base and part in one piece",
+    "images/beauty.png": "photograph",
+    "images/closeup.png": "photograph of the part",
+    "videos/appearance.mp4": "film all around",
+}
+"""Files of a run folder that people take away, and what they are."""
 
 
 class Pair(NamedTuple):
-    """Two turntables with the same views."""
+    """Photographs or turntables, after and, with the same views, before."""
 
     name: str
     title: str
-    before: Strip
+    before: Strip | None
     after: Strip
+
+
+class Download(NamedTuple):
+    """A file, as the page links it, and what it is."""
+
+    link: str
+    title: str
 
 
 class TriedSeed(NamedTuple):
@@ -89,6 +107,9 @@ def _page(run: RunRecord) -> str:
         tiles=_tiles(run),
         verdict=_verdict(run),
         tries=_tries(folder),
+        closeup=_picture(folder / "images" / "closeup.png", _CLOSE_SIZE),
+        channels=_picture(folder / "images" / "channels.png", 1536),
+        downloads=_downloads(folder),
         glb=glb,
         glb_note=glb_note,
         viewer_script=viewer_script(),
@@ -142,24 +163,44 @@ def viewer_script() -> str | None:
     return path.read_text(encoding="utf-8") if path.is_file() else None
 
 
-def turntables(folder: Path) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
-    """(name, title, frames before, frames after), as many of each: lit, then shape, where there are pictures of it."""
-    found = []
-    for name, title, row in (("appearance", "In its light", 1), ("turntable", "Shape", 2)):
-        after, before = (video_frames(folder / "videos" / f"{file}.mp4") for file in (name, f"{name}_base"))
-        if after is None or before is None or after.shape != before.shape:
-            before, after = (sheet_row(folder / "images" / f"{name}.png", number) for number in (0, row))
-        if before is not None and after is not None:
-            found.append((name, title, before, after))
-    return found
+def photographs(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """The object before and after, (1, H, W, 3) each; None where either is missing."""
+    images = [read_picture(folder / "images" / f"{name}.png") for name in ("beauty_base", "beauty")]
+    before, after = (None if image is None else np.asarray(image.convert("RGB"))[None] for image in images)
+    return None if before is None or after is None or before.shape != after.shape else (before, after)
+
+
+def shape_films(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """The turntable of the shape before and after, as many frames of each; None where there is none."""
+    after, before = (video_frames(folder / "videos" / f"{file}.mp4") for file in ("turntable", "turntable_base"))
+    if after is None or before is None or after.shape != before.shape:
+        before, after = (sheet_row(folder / "images" / "turntable.png", number) for number in (0, 2))
+    return None if before is None or after is None else (before, after)
 
 
 def _pairs(folder: Path) -> list[Pair]:
     pairs = []
-    for name, title, before, after in turntables(folder):
-        crop = common_crop(before, after)
-        pairs.append(Pair(name, title, strip(before, crop), strip(after, crop)))
+    if (stills := photographs(folder)) is not None:
+        pairs.append(Pair("photograph", "Before and after", *map(strip, stills)))
+    if (film := video_frames(folder / "videos" / "appearance.mp4")) is not None:
+        pairs.append(Pair("appearance", "All around", None, strip(film)))
+    if (films := shape_films(folder)) is not None:
+        crop = common_crop(*films)
+        pairs.append(Pair("turntable", "Shape", *(strip(frames, crop) for frames in films)))
     return pairs
+
+
+def _downloads(folder: Path) -> list[Download]:
+    return [
+        Download(name, f"{title}, {_size_of(folder / name)}")
+        for name, title in _DOWNLOADS.items()
+        if (folder / name).is_file()
+    ]
+
+
+def _size_of(path: Path) -> str:
+    size = path.stat().st_size
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.0f} kB"
 
 
 def _film(folder: Path, video: str, sheet: str, row: int) -> np.ndarray | None:

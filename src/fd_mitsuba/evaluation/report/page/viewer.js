@@ -4,7 +4,7 @@ const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 for (const viewer of document.querySelectorAll(".viewer")) {
   const angle = viewer.querySelector(".angle"), play = viewer.querySelector(".play");
-  const stages = [...viewer.querySelectorAll(".stage")];
+  const stages = [...viewer.querySelectorAll(".stage")], controls = viewer.querySelector(".turn");
   let turning = !still, seen = false, at = 0.125; // half from the side says more than from the front
 
   function show(turn) {
@@ -31,8 +31,13 @@ for (const viewer of document.querySelectorAll(".viewer")) {
     button.addEventListener("click", () => {
       for (const other of viewer.querySelectorAll(".tabs button")) other.setAttribute("aria-pressed", other === button);
       for (const stage of stages) stage.hidden = stage.dataset.name !== button.dataset.name;
+      hideControls();
     });
   }
+  function hideControls() {
+    controls.hidden = stages.some((stage) => !stage.hidden && "still" in stage.dataset);
+  }
+  hideControls();
   new IntersectionObserver(([entry]) => { seen = entry.isIntersecting; }).observe(viewer);
   let before = performance.now();
   function tick(now) {
