@@ -50,17 +50,17 @@ class GltfMesh:
 def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
     """A GLB of the meshes, in their order; `extras` goes to the scene."""
     writer = _Writer()
-    parents: dict[str, int] = {}
+    children: dict[str, list[int]] = {}
     roots: list[int] = []
     for mesh in meshes:
         node = writer.node(mesh)
         if not mesh.parent:
             roots.append(node)
             continue
-        if mesh.parent not in parents:
-            parents[mesh.parent] = writer.append("nodes", gltf.Node(name=mesh.parent, children=[]))
-            roots.append(parents[mesh.parent])
-        writer.file.nodes[parents[mesh.parent]].children.append(node)
+        if mesh.parent not in children:
+            children[mesh.parent] = []
+            roots.append(writer.append("nodes", gltf.Node(name=mesh.parent, children=children[mesh.parent])))
+        children[mesh.parent].append(node)
     return writer.finish(roots, extras)
 
 

@@ -23,7 +23,8 @@ class LatticeBox:
 
     def __init__(self, grid: TetGrid, index: Tensor) -> None:
         self._grid = grid
-        self._low, self.shape = (0, 0, 0), (0, 0, 0)
+        self._low: tuple[int, int, int] = (0, 0, 0)
+        self.shape: tuple[int, int, int] = (0, 0, 0)
         if len(index):
             ranges = [(int(c.min()) - 1, int(c.max()) + 2) for c in reversed(grid.coordinates(index))]
             self._low = (ranges[0][0], ranges[1][0], ranges[2][0])

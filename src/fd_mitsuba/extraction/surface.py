@@ -98,7 +98,7 @@ class SurfaceExtractor:
         self.union_k = union_k
         self.union_only_outside = union_only_outside
         self._depth = depth
-        self._shape = (grid.side,) * 3
+        self._shape = (grid.side, grid.side, grid.side)
         self.movable = away_from_crossings(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
         self._reach = _OFFSET_CELLS * grid.spacing * self._mark(self.active_index[self.movable]).to(sdf_base.dtype)
         self._box = LatticeBox(grid, self.active_index)

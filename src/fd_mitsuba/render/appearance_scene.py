@@ -25,8 +25,11 @@ _NOT_RENDERED = ("focal_region", "sensor", "integrator")
 class Triangles(Protocol):
     """A mesh, canonical frame, outward faces: a closed part, or the faces of a cut."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    @property
+    def vertices(self) -> np.ndarray: ...
+
+    @property
+    def faces(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)

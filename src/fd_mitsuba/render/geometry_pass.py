@@ -42,7 +42,8 @@ class GeometryPass:
                 "sizes and samples must be positive, normal_space camera or world"
             )
         startup.start(mi.variant() or startup.DEFAULT_VARIANT)
-        self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
+        self.size, self.spp, self.silhouette_spp = size, spp, silhouette_spp
+        self.normal_space: NormalSpace = normal_space
         self._tracer = MeshTracer()
         self._static_sums, self._static_sums_build = torch.zeros(0, 3), 0
 

@@ -6,6 +6,8 @@ carry floats. This looks at one state of the part alone: a run that is resumed g
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -68,7 +70,8 @@ def tether_vertices(part: np.ndarray, base: np.ndarray, room: np.ndarray) -> np.
     loose = np.flatnonzero(~held & (sizes >= max(1.0, LEAST_SHARE * part.sum())))
     if not len(loose) or not held.any():
         return np.zeros(0, dtype=np.int64)
-    distance, nearest = ndimage.distance_transform_edt(~held[label], return_indices=True)
+    found: Any = ndimage.distance_transform_edt(~held[label], return_indices=True)
+    distance, nearest = found
     marked = np.zeros(part.shape, dtype=bool)
     for number in loose:
         piece = np.argwhere(label == number)

@@ -95,7 +95,7 @@ def _wide_charts(
         return None
     chart = grown_charts(vertices, faces, edges)
     laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # its faces, their vertices, places
-    tries = 0
+    tries, found = 0, None
     for _ in range(_ROUNDS):
         waiting = [number for number in np.unique(chart).tolist() if number not in laid]
         while waiting:
@@ -112,14 +112,14 @@ def _wide_charts(
             fresh = int(chart.max()) + 1
             chart = split_chart(vertices, faces, edges, chart, number)
             waiting += [number, fresh]
-        vertex_map, split, flat = _side_by_side(faces, laid)
+        vertex_map, split, flat = found = _side_by_side(faces, laid)
         narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
         for number in np.unique(chart[narrow]).tolist():
             chart = split_chart(vertices, faces, edges, chart, number)
             del laid[number]
         if not len(narrow):
             break
-    return vertex_map, split, flat
+    return found
 
 
 def _side_by_side(
@@ -230,9 +230,10 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         if laid is not None:
             return laid
     density = _likely_density(flat, faces, texture_size)
-    best, best_density, upper = None, 0.0, np.inf
+    best, last, best_density, upper = None, flat, 0.0, np.inf
     for _ in range(_PACKINGS):
         uv, size = _pack(flat, faces, density, padding_for(texture_size))
+        last = uv / max(size, 1)
         if size <= texture_size:
             best, best_density = uv / texture_size, density
             if size > 0.97 * texture_size:
@@ -243,7 +244,7 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         inside = best_density < wanted < upper
         density = wanted if inside else (best_density + upper) / 2 if np.isfinite(upper) and best_density else wanted
     # Many tiny charts: the gutters alone fill the texture. Rather a thinner gutter than none of the faces.
-    return best if best is not None else uv / max(size, 1)
+    return best if best is not None else last
 
 
 def _likely_density(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> float:

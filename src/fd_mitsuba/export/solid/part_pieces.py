@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ def bridge_gaps(
     floating = [piece for piece in range(1, count + 1) if large[piece] and not _joined(label == piece, sdf_base)]
     if not floating:
         return sdf_part, []
-    nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     nearest_piece = label[tuple(nearest)]
     bridged, half_cell = sdf_part, grid.spacing / 2
     bridges: list[Bridge] = []

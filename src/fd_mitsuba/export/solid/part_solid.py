@@ -187,7 +187,7 @@ def _surface(grid: TetGrid, positions: Tensor, inside: Tensor, fields: list[Tens
     A vertex lies where the first of the fields becomes 0 along its edge: marching their minimum instead would pull
     the visible surface inward wherever another field is the smaller one at the inner end.
     """
-    shape = (grid.side,) * 3
+    shape = (grid.side, grid.side, grid.side)
     edges, faces = crossing_faces(inside.view(shape))
     lower, upper = edge_ends(edges, shape)
     inner = torch.where(inside[lower], lower, upper)
