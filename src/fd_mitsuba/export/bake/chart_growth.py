@@ -13,9 +13,11 @@ from scipy.sparse.csgraph import dijkstra
 from fd_mitsuba.export.final_surface.mesh_rings import Edges, cross_of_faces
 
 _FIRST, _MOST = 10, 22
+"""Charts at first, and at most: each chart costs a gutter, each one too few a distorted or overlapping one."""
 _WIDEST = 85.0
 """Degrees between a chart's mean normal and any of its faces: beyond it another seed is set."""
 _MOVES = 3
+"""Times that the seeds are moved to their charts' middles, as in Lloyd's algorithm, before more are set."""
 _SMALLEST = 0.004
 """Share of the surface below which a chart is joined to another, if that stays a disc."""
 
@@ -144,7 +146,7 @@ def _smoothed(edges: Edges, faces: np.ndarray, chart: np.ndarray) -> np.ndarray:
     sides = edges.faces[edges.face_edges]
     beside = np.where(sides[..., 0] == np.arange(len(faces))[:, None], sides[..., 1], sides[..., 0])
     before = euler_numbers(faces, edges, chart, count)
-    for turn in range(6):
+    for turn in range(6):  # half of the faces at a time: neighbours that moved together would only swap their teeth
         near = chart[beside]
         a, b, c = near.T
         pair = np.where(a == b, a, np.where(b == c, b, c))

@@ -1,4 +1,14 @@
-"""A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart."""
+"""A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart.
+
+    charts    `grown_charts` (few, wide) or xatlas (any mesh)     which faces lie together, and where the seams are
+    flat      `flattened`, or xatlas                              each chart laid flat, in the mesh's own unit
+    notches   `open_notches`, `crowded`                           places where a texel would belong to two of its faces
+    packed    `packed_charts` (few), or xatlas                    all charts in the unit square, with gutters
+    left out  `place_left_out`                                    faces without an area, which xatlas packs nowhere
+
+What travels through these steps is a triple: `vertex_map` (S,) says which vertex each split vertex was, `split` (F, 3)
+are the faces in split vertices, and `flat` or `uv` (S, 2) where those lie. A vertex on a seam is there once a chart.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +34,7 @@ _ROUNDS, _TRIES = 3, 40
 _FEW_CHARTS = 100
 """So many charts are laid one by one; more would take too long."""
 _PACKINGS = 6
+"""Densities that are tried until xatlas's packing is as large as the texture; it takes a wish, not a size."""
 _LONGEST = 1000.0
 """The size that xatlas sees: it takes triangles below 1e-7 in area for nothing, which slivers of a unit mesh are."""
 
