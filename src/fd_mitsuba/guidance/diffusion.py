@@ -8,7 +8,7 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
+from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
@@ -61,7 +62,7 @@ class DiffusionGuidance(Denoiser):
                 f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
             )
         self.view_grid = components.conventions.view_grid
-        self.normal_space: Literal["camera", "world"] | None = components.conventions.normal_space
+        self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
         self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 
-from fd_mitsuba.conventions import GEOMETRY_CHANNELS
+from fd_mitsuba.conventions import GEOMETRY_CHANNELS, NormalSpace
 from fd_mitsuba.errors import RunStopped
 
 Phase = Literal["coarse", "refined", "appearance"]
@@ -135,7 +135,7 @@ class Guidance(Protocol):
         ...
 
     @property
-    def normal_space(self) -> Literal["camera", "world"] | None:
+    def normal_space(self) -> NormalSpace | None:
         """Frame of the normals that the model was trained with; None: either will do."""
         ...
 

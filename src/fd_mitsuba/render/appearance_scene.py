@@ -125,7 +125,7 @@ def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | Non
     if not opened:
         return shapes
     left = []
-    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs().scene), strict=True)):
+    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs.scene), strict=True)):
         path = opened.get(number)
         if path is None:
             left += [shape] * (number not in opened)

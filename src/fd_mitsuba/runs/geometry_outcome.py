@@ -31,7 +31,6 @@ from fd_mitsuba.runs.locality import measure_locality
 from fd_mitsuba.runs.own_meshes import as_mesh, base_mesh, edited_mesh, start_mesh
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_mode import cut_faces_name
-from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -174,7 +173,7 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
 
 def cut_out(scene: EditScene, solids: dict[str, Solid]) -> CutBase:
     """What the parts of a scene that subtracts take away, and what they leave of the base."""
-    return cut_base(scene, SceneFile(scene.path, scene.parameters), solids)
+    return cut_base(scene, scene.inputs.scene, solids)
 
 
 def removed_parts(scene: EditScene, cut: CutBase) -> dict[str, Solid]:

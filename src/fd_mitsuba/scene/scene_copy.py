@@ -47,7 +47,7 @@ class SceneCopy:
     @classmethod
     def of(cls, scene: EditScene) -> SceneCopy:
         """The plan for a scene; nothing is read but what says which files there are."""
-        inputs, plan = scene.inputs(), cls()
+        inputs, plan = scene.inputs, cls()
         home = scene.path.parent
         listed = dict.fromkeys(inputs.files)
         beside = [path for path in scene.files if path not in listed]  # such as the record of earlier rounds
