@@ -4,6 +4,7 @@
 #   make fuzz N=5000 SEED=1           spoiled inputs, and a table of how the command line takes them
 #   make docs                              the documentation site, into build/site
 #   make wheel                             builds the wheel and tries it outside the repository
+#   make types                             the type checker, a minute
 #   make bench | lint | clean
 #   TORCH_INDEX=<url> make demo            take torch from another index first (see README, "Installation")
 PYTHON ?= python3
@@ -19,7 +20,7 @@ SEED ?= 0
 PY := .venv/bin/python
 STAMP := .venv/.installed
 
-.PHONY: demo test fuzz docs wheel bench lint clean install llvm
+.PHONY: demo test fuzz docs wheel bench lint types clean install llvm
 .DEFAULT_GOAL := demo
 
 install: $(STAMP)
@@ -58,6 +59,9 @@ wheel: $(STAMP) llvm
 lint: $(STAMP)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check --quiet .
+
+types: $(STAMP)
+	$(PY) -m basedpyright
 
 clean:
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

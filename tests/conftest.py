@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
+from shape_checks import PLACES
+
+jaxtyping.install_import_hook(PLACES, "shape_checks.checked")  # before anything imports them
 
 INTEGRATOR = """<integrator type="dual_path">
     <string name="prompt" value="a pig with two wings"/>

@@ -22,6 +22,7 @@ from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
 from fd_mitsuba.config import ChosenSettings, RunConfig, misfits, settings_for_run
 from fd_mitsuba.config.registry import load_plugins
+from fd_mitsuba.conventions import STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run import Run
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from fd_mitsuba.scene.edit_scene import EditScene
     from fd_mitsuba.training.stage import OnStep
 
-STAGES = ("geometry", "appearance")
 _LIGHT = Path(__file__).with_name("demo") / "lighting" / "city.exr"
 
 

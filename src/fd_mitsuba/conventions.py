@@ -40,5 +40,11 @@ Weighting = Literal["sds", "uniform", "fantasia3d", "inverse", "ism"]
 NormalAugmentation = Literal["none", "rotation", "rotation_flip"]
 """Random turns of the coarse phase's normals; `guidance.normal_augmentation` has them."""
 
+NormalSpace = Literal["camera", "world"]
+"""Frame of the normals in a picture; `world` is the canonical frame."""
+
+STAGES = ("geometry", "appearance")
+"""The stages of a run, in their order."""
+
 BASE_NAME = "base"
 DEFAULT_PART_NAME = "part"

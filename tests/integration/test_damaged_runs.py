@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from test_evaluate import SETTINGS, Average
+from tiny_runs import ORANGE_PART, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
@@ -32,12 +32,7 @@ ODD = ["3", '"text"', "[]", "null", "true", "Infinity", "-1e999", "9" * 5000, "[
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
     """A finished run of both stages, with all exports."""
-    root = tmp_path_factory.mktemp("damaged")
-    write_ply(root / "animal.ply", *animal)
-    part = PART.replace("<float", '<rgb name="base_color" value="0.8, 0.3, 0.1"/><float')
-    pieces = ['<scene version="3.0.0">', INTEGRATOR, LIGHT, BASE, part, REGION, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
-    (root / "tiny.toml").write_text(SETTINGS)
+    root = write_place(tmp_path_factory.mktemp("damaged"), animal, SETTINGS, part=ORANGE_PART)
     run = root / "run"
     config = RunConfig.load(root / "tiny.toml")
     pipeline.run(load_edit_scene(root / "scene.xml"), config, run, quiet=True, say=lambda line: None)

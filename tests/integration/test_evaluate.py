@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from PIL import Image
+from tiny_runs import ORANGE_PART, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.evaluation import run_evaluation as evaluate
@@ -66,13 +66,7 @@ class Average:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
-    root = tmp_path_factory.mktemp("evaluated")
-    write_ply(root / "animal.ply", *animal)
-    part = PART.replace("<float", '<rgb name="base_color" value="0.8, 0.3, 0.1"/><float')
-    pieces = ['<scene version="3.0.0">', INTEGRATOR, LIGHT, BASE, part, REGION, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
-    (root / "tiny.toml").write_text(SETTINGS)
-    return root
+    return write_place(tmp_path_factory.mktemp("evaluated"), animal, SETTINGS, part=ORANGE_PART)
 
 
 @pytest.mark.slow

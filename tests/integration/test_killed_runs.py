@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
+from tiny_runs import BOTH_STAGES_OUTPUT, FIELD, ORANGE_PART, TEXTURE, run_words, start_words, write_place
 
-ROOT = Path(__file__).resolve().parents[2]
-SETTINGS = """
-[field]
-levels = 2
-log2_table = 8
-base_resolution = 4
-finest_resolution = 16
+SETTINGS = (
+    FIELD
+    + """
 [geometry]
 steps = 6
 grid_resolution = 16
@@ -29,9 +23,9 @@ lambda_sds = 0.0
 focal_samples = 256
 views = 1
 spp = 1
-[texture]
-levels = 2
-log2_table = 8
+"""
+    + TEXTURE
+    + """
 [appearance]
 steps = 5
 views = 2
@@ -41,34 +35,19 @@ lambda_sds = 0.0
 style = true
 style_samples = 32
 boundary_reach = 0.1
-[output]
-sheet_every = 2
-checkpoint_every = 2
-turntable_frames = 2
-turntable_size = 32
-picture_size = 32
-texture_size = 32
 """
+    + BOTH_STAGES_OUTPUT
+)
 SPEAKING_OF_TIME = {"seconds", "peak_memory_mb"}
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
-    root = tmp_path_factory.mktemp("killed")
-    write_ply(root / "animal.ply", *animal)
-    part = PART.replace("<float", '<rgb name="base_color" value="0.8, 0.3, 0.1"/><float')
-    pieces = ['<scene version="3.0.0">', INTEGRATOR, LIGHT, BASE, part, REGION, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
-    (root / "tiny.toml").write_text(SETTINGS)
-    return root
+    return write_place(tmp_path_factory.mktemp("killed"), animal, SETTINGS, part=ORANGE_PART)
 
 
 def start(place: Path, output: str, *more: str) -> subprocess.Popen[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "fd_mitsuba", "run", str(place / "scene.xml"), "-c", str(place / "tiny.toml")]
-    command += ["-o", str(place / output), "-t", "1", "-q", *more]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, env=environment, text=True, start_new_session=True, **pipes)
+    return start_words(run_words(place, output, *more))
 
 
 def finish(place: Path, output: str, *more: str) -> float:

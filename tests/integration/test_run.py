@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import random
 import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,9 +18,9 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import trimesh
-from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
 from PIL import Image
 from tiny_pipelines import save_pipeline
+from tiny_runs import FIELD, run_words, start_words, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
@@ -35,12 +33,9 @@ from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.record import read_metrics
 
 ROOT = Path(__file__).resolve().parents[2]
-SETTINGS = """
-[field]
-levels = 2
-log2_table = 8
-base_resolution = 4
-finest_resolution = 16
+SETTINGS = (
+    FIELD
+    + """
 [geometry]
 steps = 6
 coarse_fraction = 0.5
@@ -57,6 +52,7 @@ turntable_frames = 3
 turntable_size = 32
 picture_size = 32
 """
+)
 STEPS = 6
 LONG = ("--set", "geometry.lambda_sds=0", "--set", "geometry.steps=100000", "--set", "output.checkpoint_every=7")
 """A run without guidance: its steps take milliseconds, and writing is a good part of them, so kills hit the writes."""
@@ -65,11 +61,7 @@ LONG = ("--set", "geometry.lambda_sds=0", "--set", "geometry.steps=100000", "--s
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
     """A folder with a scene, settings, and pipelines shaped like SD 1.5 and SD 2.1."""
-    root = tmp_path_factory.mktemp("place")
-    write_ply(root / "animal.ply", *animal)
-    pieces = ['<scene version="3.0.0">', INTEGRATOR, LIGHT, BASE, PART, REGION, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
-    (root / "tiny.toml").write_text(SETTINGS)
+    root = write_place(tmp_path_factory.mktemp("place"), animal, SETTINGS)
     for kind in ("sd15", "sd21"):
         save_pipeline(kind, root / kind)
     return root
@@ -77,37 +69,11 @@ def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
 
 def arguments(place: Path, output: str, *more: str) -> list[str]:
     model = f"guidance.model={place / 'sd15'}"
-    scene, settings = str(place / "scene.xml"), str(place / "tiny.toml")
-    return [
-        "run",
-        scene,
-        "-c",
-        settings,
-        "--set",
-        model,
-        "-o",
-        str(place / output),
-        "-t",
-        "1",
-        "-q",
-        "--stage",
-        "geometry",
-        *more,
-    ]
+    return run_words(place, output, "--set", model, "--stage", "geometry", *more)
 
 
 def start(place: Path, output: str, *more: str) -> subprocess.Popen[str]:
-    environment = os.environ | {
-        "PYTHONPATH": str(ROOT / "src"),
-        "HF_HUB_OFFLINE": "1",
-        "OMP_NUM_THREADS": "1",
-        "XDG_CACHE_HOME": str(place / "cache"),
-    }
-    command = [sys.executable, "-m", "fd_mitsuba", *arguments(place, output, *more)]
-    # A process group of its own: what the test run's terminal sends does not reach it.
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    return start_words(arguments(place, output, *more), HF_HUB_OFFLINE="1", XDG_CACHE_HOME=str(place / "cache"))
 
 
 @contextlib.contextmanager

@@ -9,29 +9,26 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from conftest import BASE, INTEGRATOR, PART, REGION, write_ply
 from PIL import Image
 from tiny_pipelines import save_pipeline
+from tiny_runs import BOTH_STAGES_OUTPUT, FIELD, TEXTURE, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.record import read_metrics
 
-SETTINGS = """
-[field]
-levels = 2
-log2_table = 8
-base_resolution = 4
-finest_resolution = 16
+SETTINGS = (
+    FIELD
+    + """
 [geometry]
 steps = 2
 grid_resolution = 16
 focal_samples = 256
 views = 2
 spp = 1
-[texture]
-levels = 2
-log2_table = 8
+"""
+    + TEXTURE
+    + """
 [appearance]
 steps = 3
 views = 2
@@ -40,25 +37,16 @@ picture_size = 16
 style = true
 style_samples = 32
 boundary_reach = 0.1
-[output]
-sheet_every = 2
-checkpoint_every = 2
-turntable_frames = 2
-turntable_size = 32
-picture_size = 32
-texture_size = 32
 """
+    + BOTH_STAGES_OUTPUT
+)
 LIGHT = """<default name="level" value="1.0"/>
   <emitter type="constant" id="light"><rgb name="radiance" value="$level"/></emitter>"""
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
-    root = tmp_path_factory.mktemp("whole")
-    write_ply(root / "animal.ply", *animal)
-    pieces = ['<scene version="3.0.0">', LIGHT, INTEGRATOR, BASE, PART, REGION, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
-    (root / "tiny.toml").write_text(SETTINGS)
+    root = write_place(tmp_path_factory.mktemp("whole"), animal, SETTINGS, light=LIGHT)
     save_pipeline("sd15", root / "sd15")
     return root
 

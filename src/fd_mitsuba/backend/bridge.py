@@ -89,9 +89,12 @@ class _Crossing(torch.autograd.Function):
             ctx.like = [(tensor.shape, tensor.dtype) for tensor in tensors]
             return to_torch(dr.detach(output))
 
+    # What `once_differentiable` makes of it takes no keywords, which torch's own signature has.
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, gradient: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
         with _LOCK:
             inputs, output = ctx.traced.inputs, ctx.traced.output
             wanted = [array for array in inputs if dr.grad_enabled(array)]

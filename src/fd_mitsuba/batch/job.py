@@ -126,7 +126,7 @@ def is_finished(job: Job) -> bool:
     except ValueError:
         return False
     stage = "appearance" if "appearance" in stages else "geometry"
-    parameters = dict(item.partition("=")[::2] for item in job.definitions)
+    parameters = {name: value for name, _, value in (item.partition("=") for item in job.definitions)}
     now = job.settings()
     return (
         before.content_hash(stage) == now.completed_by(before).content_hash(stage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import time
@@ -40,7 +41,7 @@ def run_with_ray(
     os.environ.setdefault("RAY_agent_register_timeout_ms", "120000")  # a busy machine starts slowly
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # it warns of a change that does not matter here
     try:
-        import ray
+        ray: Any = importlib.import_module("ray")  # an extra: the type checker cannot count on it
     except ImportError:
         raise UserError("--ray: Ray is not installed; pip install 'fd_mitsuba[ray]', or leave --ray out") from None
     own = {"num_cpus": workers * threads, "include_dashboard": False} if address == "local" else {}

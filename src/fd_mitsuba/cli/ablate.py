@@ -49,15 +49,15 @@ def _ablate(options: argparse.Namespace) -> int:
     rows = chosen_rows(options.only, options.stage)
     protocol = Protocol(options.views, options.size, options.spp)
     judge = ClipJudge.load(options.judge)
-    jobs = ablation_jobs(
+    shapes, looks = ablation_jobs(
         scene, Path(options.config), options.seeds, rows, folder, options.overrides, options.definitions, options.stage
     )
-    jobs = tuple([replace(job, plugins=tuple(options.plugins)) for job in stage] for stage in jobs)
-    for job in (*jobs[0], *jobs[1]):
+    shapes, looks = ([replace(job, plugins=tuple(options.plugins)) for job in jobs] for jobs in (shapes, looks))
+    for job in (*shapes, *looks):
         job.settings()
     beside = Path(options.scenes) if options.scenes else scene.resolve().parent.parent
     rivals = prompts_of_scenes(beside) if options.scenes or any(beside.glob("*/scene.xml")) else []
-    results = ablate(jobs, rows, judge, protocol, rivals, options.workers, remark, folder / "batch.json")
+    results = ablate((shapes, looks), rows, judge, protocol, rivals, options.workers, remark, folder / "batch.json")
     cells, titles = ablation_rows(results), ablation_header()
     record = [
         {"row": asdict(result.row), "lit": result.lit, "shape": result.shape, "runs": list(map(str, result.folders))}

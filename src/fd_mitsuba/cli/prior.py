@@ -87,7 +87,9 @@ def _prior(options: argparse.Namespace) -> int:
     from fd_mitsuba.guidance.builtin import builtin_folder
     from fd_mitsuba.guidance.model_conventions import read_model_conventions
 
-    words = read_model_conventions(builtin_folder()).vocabulary.model_dump(mode="json")
+    vocabulary = read_model_conventions(builtin_folder()).vocabulary
+    assert vocabulary is not None  # the shipped prior's
+    words = vocabulary.model_dump(mode="json")
     if options.json:
         print(json.dumps(words, indent=2))
         return 0

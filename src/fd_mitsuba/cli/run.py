@@ -46,7 +46,8 @@ def run_scene(options: argparse.Namespace) -> int:
 
         options.scene, options.regions = resumed_scene(folder, options.scene, options.regions, remark)
     scene = load(options, config=settings.config, beside=folder)
-    from fd_mitsuba.api import STAGES, edit
+    from fd_mitsuba.api import edit
+    from fd_mitsuba.conventions import STAGES
 
     run = edit(
         scene,

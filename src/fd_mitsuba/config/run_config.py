@@ -23,6 +23,7 @@ from fd_mitsuba.config.sections import (
     TextureConfig,
 )
 from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml, shortened
+from fd_mitsuba.conventions import STAGES
 from fd_mitsuba.errors import UserError
 
 _CHOICES = ("kind", "variant")
@@ -128,7 +129,7 @@ class RunConfig(Section):
         """These settings with the options that `other`'s choices of the same names have besides."""
         guidance = {name: getattr(self.guidance, name).completed_by(getattr(other.guidance, name)) for name in _CHOICES}
         changed: dict[str, Any] = {"guidance": self.guidance.model_copy(update=guidance)}
-        for stage in ("geometry", "appearance"):
+        for stage in STAGES:
             section, theirs = getattr(self, stage), getattr(other, stage).losses
             losses = {
                 name: loss.with_options(loss.choice(name).completed_by(theirs[name].choice(name)).options)

@@ -29,7 +29,7 @@ from fd_mitsuba.config.bounds import (
 )
 from fd_mitsuba.config.choice import Choice, Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
-from fd_mitsuba.conventions import NormalAugmentation, TextureChannel, Weighting
+from fd_mitsuba.conventions import NormalAugmentation, NormalSpace, TextureChannel, Weighting
 
 
 class Section(BaseModel):
@@ -123,7 +123,7 @@ class GeometryConfig(Section):
     """Samples a pixel."""
     silhouette_spp: Samples = 1
     """Points on outlines, for each pixel of an image; they carry the gradient of the silhouettes."""
-    normal_space: Literal["camera", "world"] = "camera"
+    normal_space: NormalSpace = "camera"
     """Frame of the normals that are rendered."""
 
     @model_validator(mode="after")

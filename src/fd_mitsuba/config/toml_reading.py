@@ -115,7 +115,7 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     problem = error.errors()[0]
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "value_error":  # our own words, about several values
-        return f"{problem['ctx']['error']}; change the value"
+        return f"{problem.get('ctx', {})['error']}; change the value"
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model) if "." in key else list(model.model_fields)
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.4)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from fd_mitsuba.export.pictures import srgb_from_linear
 
@@ -81,7 +81,7 @@ def foreign_colour(
     colours = truth(witnesses)
     shown, own = filtered(small, places), truth(points)
     stray = np.zeros(len(points))
-    for number, near in enumerate(cKDTree(witnesses).query_ball_point(points, reach, return_sorted=False)):
+    for number, near in enumerate(KDTree(witnesses).query_ball_point(points, reach, return_sorted=False)):
         there = np.concatenate([colours[near], own[number : number + 1]])
         outside = np.maximum(there.min(axis=0) - shown[number], shown[number] - there.max(axis=0))
         stray[number] = max(float(outside.max()), 0.0)

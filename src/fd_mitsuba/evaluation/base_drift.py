@@ -53,7 +53,7 @@ def export_drift(scene: EditScene, folder: Path) -> dict[str, Any]:
     """
     exported = folder / "export" / "base"
     sources = {path for mesh in scene.base for path in mesh.source_files}
-    pictures = set(_pictures(scene.inputs().scene))
+    pictures = set(_pictures(scene.inputs.scene))
     copies = {source: _copy_of(source, exported) for source in sources | pictures}
     present = {source: copy for source, copy in copies.items() if copy is not None}
     same = [_sha(source) == _sha(copy) for source, copy in present.items()]
@@ -88,7 +88,7 @@ def chamfer(one: Mesh, other: Mesh, seed: int = 0) -> float:
 def _exported_base(scene: EditScene, exported: Path, copies: dict[Path, Path | None]) -> Mesh | None:
     """All base shapes as the exported files have them, user frame; None if one is missing."""
     vertices, faces, first = [], [], 0
-    for element, mesh in zip(base_elements(scene.inputs().scene), scene.base, strict=True):
+    for element, mesh in zip(base_elements(scene.inputs.scene), scene.base, strict=True):
         properties = {name: value for name, value in element.properties.items() if name != "to_world"}
         transform, plugin = element.properties.get("to_world"), element.plugin
         to_world = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), np.float64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,6 +18,9 @@ from torch.nn.functional import cosine_similarity, interpolate, normalize
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.clip_loading import locate_clip, open_clip, read_clip_conventions, read_preprocessing
+
+if TYPE_CHECKING:
+    from transformers import CLIPModel
 
 _PICTURES_AT_ONCE = 64
 
@@ -56,7 +59,7 @@ class ClipJudge:
 
     def __init__(
         self,
-        model: torch.nn.Module,
+        model: CLIPModel,
         tokenizer: Any,
         preprocessing: Preprocessing,
         name: str,
@@ -79,7 +82,8 @@ class ClipJudge:
         conventions = read_clip_conventions(folder)
         preprocessing = Preprocessing(*read_preprocessing(folder))
         network, tokenizer = open_clip(folder)
-        side = network.config.vision_config.image_size
+        settings: Any = network.config
+        side = settings.vision_config.image_size
         if preprocessing.crop != side:
             raise UserError(
                 f"{folder / 'preprocessor_config.json'}: pictures of {preprocessing.crop} pixels, but the model takes "
@@ -103,7 +107,8 @@ class ClipJudge:
     @torch.no_grad()
     def texts(self, texts: list[str]) -> Tensor:
         """Features (N, D) float32, not normalised; a text longer than the model takes is cut."""
-        length = min(self._tokenizer.model_max_length, self._model.config.text_config.max_position_embeddings)
+        settings: Any = self._model.config
+        length = min(self._tokenizer.model_max_length, settings.text_config.max_position_embeddings)
         tokens = self._tokenizer(
             list(texts), padding="max_length", max_length=length, truncation=True, return_tensors="pt"
         )

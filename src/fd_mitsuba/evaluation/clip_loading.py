@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -13,6 +13,9 @@ from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.guidance.builtin import verify_hashes
 from fd_mitsuba.guidance.layout import read_json
 from fd_mitsuba.io.hub import hub_snapshot, local_folder
+
+if TYPE_CHECKING:
+    from transformers import CLIPModel
 
 EVALUATOR_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "evaluator"
 BUILTIN_NAME = "built-in evaluator"
@@ -85,7 +88,7 @@ def read_preprocessing(folder: Path) -> tuple[int, int, tuple, tuple]:
         raise UserError(f"{path}: not a CLIP preprocessor ({first_line(error)}); {_REMEDY}") from None
 
 
-def open_clip(folder: Path) -> tuple[torch.nn.Module, Any]:
+def open_clip(folder: Path) -> tuple[CLIPModel, Any]:
     """The network in float32 and the tokenizer, from local files alone.
 
     Raises:
@@ -98,9 +101,10 @@ def open_clip(folder: Path) -> tuple[torch.nn.Module, Any]:
         raise UserError(f"{folder / 'config.json'}: a model of type {kind!r}, not 'clip'; name a CLIP model")
     try:
         with _no_progress_bar():
-            model, info = transformers.CLIPModel.from_pretrained(
+            loaded: Any = transformers.CLIPModel.from_pretrained(
                 str(folder), dtype=torch.float32, local_files_only=True, output_loading_info=True
             )
+        model, info = loaded
         tokenizer = transformers.AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # the libraries raise many kinds: a missing or cut file, tensors of another size
         raise UserError(f"{folder}: cannot be loaded as a CLIP model ({first_line(error)}); {_REMEDY}") from None

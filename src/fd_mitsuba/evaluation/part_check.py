@@ -30,7 +30,7 @@ def _check(path: Path, scale: float) -> dict:
         mesh = trimesh.load(path, process=False) if path.is_file() else None
     except Exception:  # of a damaged file, whatever its reader says of it
         mesh = None
-    if mesh is None or not len(getattr(mesh, "faces", ())):
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return {"lost": True, "valid": False, "faces": 0, "closed": False, "pieces": 0, "volume": 0.0}
     if is_coarse(mesh.vertices):  # products of three coordinates would leave no digits for the volume
         mesh.apply_translation(-mesh.bounds.mean(axis=0))

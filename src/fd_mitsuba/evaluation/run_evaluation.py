@@ -104,8 +104,9 @@ def evaluate_run(
             views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
     vocabulary = builtin_vocabulary()
     own, simple = _words(scene)
-    known_to_builtin = vocabulary is not None and ScenePrompts(scene.path, own, simple).known_to(vocabulary)
-    among = [rival.words for rival in rivals if not known_to_builtin or rival.known_to(vocabulary)]
+    if vocabulary is not None and not ScenePrompts(scene.path, own, simple).known_to(vocabulary):
+        vocabulary = None
+    among = [rival.words for rival in rivals if vocabulary is None or rival.known_to(vocabulary)]
     result = {
         "format": FORMAT,
         "key": key,
@@ -118,7 +119,7 @@ def evaluate_run(
         "steps": [config.geometry.steps, None if appearance is None else config.appearance.steps],
         "judge": judge.name,
         "views": about_views(views),
-        **judged(views, judge, own, simple, among, vocabulary if known_to_builtin else None),
+        **judged(views, judge, own, simple, among, vocabulary),
         **measured(scene, folder, views),
     }
     if appearance is not None and not scene.subtracts:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from fd_mitsuba.export.bake.tangents import vertex_normals
 
@@ -44,7 +44,7 @@ def surface_noise(
     normals = vertex_normals(vertices, faces) if normals is None else np.asarray(normals, dtype=np.float64)
     points, shading = _spread(vertices, faces, normals, seed)
     radius = smoothed_over * float(np.ptp(vertices, axis=0).max())
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     pairs = pairs[np.einsum("ij,ij->i", shading[pairs[:, 0]], shading[pairs[:, 1]]) > 0]
     return float(np.degrees(_angle(shading, _fitted(points, shading, pairs, radius))).mean())
 

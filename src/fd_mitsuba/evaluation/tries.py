@@ -13,12 +13,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.conventions import STAGES
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.evaluation.report.run_page import reported
 from fd_mitsuba.evaluation.verdict import SURE, can_be_judged, judge_run
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import read_json_object, write_json
-from fd_mitsuba.runs.pipeline import STAGES, run
+from fd_mitsuba.runs.pipeline import run
 from fd_mitsuba.runs.run_folder import TRIES_FOLDER, TRIES_RECORD, check_folder
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.training.record import read_metrics

@@ -59,7 +59,7 @@ def export_assets(
     """
     exporters = chosen_exporters(formats)
     _check(scene, parts, folder, texture_size)
-    inputs = scene.inputs()
+    inputs = scene.inputs
     file = inputs.scene
     states = {part.name: part for part in read_stack(folder / "mitsuba")[0] if part.state != SHOWN}
     absent = {part.shape for part in scene.earlier if part.name in states}

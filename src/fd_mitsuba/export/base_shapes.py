@@ -110,14 +110,14 @@ def _shape(
         values = np.array(parameters[key], dtype=np.float32) if key in parameters else np.zeros(0)
         return values.reshape(-1, width) if values.size else None
 
-    vertices, moved = rows(VERTICES, 3), np.zeros(3)
+    vertices, moved = np.array(parameters[VERTICES], dtype=np.float32).reshape(-1, 3), np.zeros(3)
     if is_coarse(vertices):
         vertices, moved = _near_origin(double_positions(file.resolve(str(plain.get("filename", ""))), vertices))
     normals = None if plain.get("face_normals", False) else rows(NORMALS, 3)
     if normals is not None:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.where(np.abs(length - 1) < 1e-3, normals, normals / np.maximum(length, 1e-30))
-        normals = np.where(length > 1e-6, normals, np.float32([0, 1, 0])).astype(np.float32)
+        normals = np.where(length > 1e-6, normals, np.array([0, 1, 0], np.float32)).astype(np.float32)
     transform = element.properties.get("to_world")
     to_world = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), dtype=np.float64)
     faces, uv, colours = np.array(parameters[FACES]).astype(np.int64).reshape(-1, 3), rows(UVS, 2), None

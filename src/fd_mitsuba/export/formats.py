@@ -179,7 +179,7 @@ def _gltf_meshes(content: ExportContent) -> list[GltfMesh]:
             about = {"part": old.name, "prompt": old.prompt, "round": old.round}
         meshes.append(
             GltfMesh(
-                name, vertices, faces, shape.material, normals, shape.uv, tangents, shape.colours, place, parent, about
+                name, vertices, faces, shape.material, normals, shape.uv, shape.colours, tangents, place, parent, about
             )
         )
     for part in content.parts:
@@ -194,7 +194,7 @@ def _gltf_meshes(content: ExportContent) -> list[GltfMesh]:
                 part.material,
                 mesh.normals,
                 mesh.uv,
-                tangents,
+                tangents=tangents,
                 to_world=away,
                 extras=about,
             )

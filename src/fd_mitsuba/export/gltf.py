@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pygltflib as gltf
 
+from fd_mitsuba.export.export_mesh import ExportMesh
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture
 
@@ -18,30 +19,18 @@ _SHAPE = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4}
 
 
 @dataclass(frozen=True)
-class GltfMesh:
-    """A node with one mesh of one material; everything is written as float32, and UVs with the origin top left.
+class GltfMesh(ExportMesh):
+    """A node with one mesh; everything is written as float32, and UVs with the origin top left.
 
     Attributes:
-        name: of node and mesh.
-        vertices: (V, 3).
-        faces: (F, 3), counter-clockwise seen from outside.
-        normals: (V, 3) unit; None: flat faces.
-        uv: (V, 2).
         tangents: (V, 4); only written with a normal map.
-        colours: (V, 3) linear in [0, 1].
         to_world: (4, 4), the node's place.
         parent: name of an empty node to hang it below, "" for the top.
         extras: what else to say about the node.
+        Others: see `ExportMesh`.
     """
 
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: PbrMaterial
-    normals: np.ndarray | None = None
-    uv: np.ndarray | None = None
     tangents: np.ndarray | None = None
-    colours: np.ndarray | None = None
     to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     parent: str = ""
     extras: dict[str, Any] = field(default_factory=dict)
@@ -50,17 +39,17 @@ class GltfMesh:
 def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
     """A GLB of the meshes, in their order; `extras` goes to the scene."""
     writer = _Writer()
-    parents: dict[str, int] = {}
+    children: dict[str, list[int]] = {}
     roots: list[int] = []
     for mesh in meshes:
         node = writer.node(mesh)
         if not mesh.parent:
             roots.append(node)
             continue
-        if mesh.parent not in parents:
-            parents[mesh.parent] = writer.append("nodes", gltf.Node(name=mesh.parent, children=[]))
-            roots.append(parents[mesh.parent])
-        writer.file.nodes[parents[mesh.parent]].children.append(node)
+        if mesh.parent not in children:
+            children[mesh.parent] = []
+            roots.append(writer.append("nodes", gltf.Node(name=mesh.parent, children=children[mesh.parent])))
+        children[mesh.parent].append(node)
     return writer.finish(roots, extras)
 
 

@@ -18,9 +18,14 @@ from fd_mitsuba.export.gltf import is_placement
 class Place(Protocol):
     """One copy: of which part, (4, 4) in the user's frame, and whether the base comes along."""
 
-    part: str
-    to_world: np.ndarray
-    base: bool
+    @property
+    def part(self) -> str: ...
+
+    @property
+    def to_world(self) -> np.ndarray: ...
+
+    @property
+    def base(self) -> bool: ...
 
 
 def instance_glb(asset: bytes, placements: Sequence[Place]) -> bytes:
@@ -37,6 +42,7 @@ def instance_glb(asset: bytes, placements: Sequence[Place]) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = gltf.GLTF2.load_from_bytes(asset)
+    assert file is not None and file.scenes[0].nodes is not None  # `export.gltf` wrote it
     sources = {file.nodes[number].name: number for number in file.scenes[0].nodes}
     before, file.nodes = file.nodes, []
     wanted: dict[str, list[np.ndarray]] = {}
@@ -45,10 +51,11 @@ def instance_glb(asset: bytes, placements: Sequence[Place]) -> bytes:
             if name not in sources:
                 raise UserError(f"{name!r} is not in the exported GLB; export the run anew")
             wanted.setdefault(name, []).append(placement.to_world)
-    file.scenes[0].nodes = [_copied(file, before, number) for name, number in sources.items() if name not in wanted]
+    roots = [_copied(file, before, number) for name, number in sources.items() if name not in wanted]
     for name, places in wanted.items():
         for count, place in enumerate(places, 1):
-            file.scenes[0].nodes.append(_placed(file, before, sources[name], place, f"_{count}"))
+            roots.append(_placed(file, before, sources[name], place, f"_{count}"))
+    file.scenes[0].nodes = roots
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return b"".join(file.save_to_bytes())

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
 
+from fd_mitsuba.export.export_mesh import ExportMesh
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture, srgb_from_linear
 from fd_mitsuba.io.float_steps import is_coarse
 from fd_mitsuba.io.safe_text import safe_name
 
 
-@dataclass(frozen=True)
-class ObjMesh:
-    """A group of an OBJ file, in the user frame.
+class ObjMesh(ExportMesh):
+    """A group of an OBJ file, in the user frame; its name is that of object, group and material, after `safe_name`.
 
-    Attributes:
-        name: of object, group and material, after `safe_name`.
-        vertices: (V, 3).
-        faces: (F, 3).
-        normals: (V, 3) unit, None to leave them out.
-        uv: (V, 2), origin top left; written with the origin bottom left, as OBJ has it.
-        colours: (V, 3) linear; written behind the position, as sRGB, which is how they are read.
+    UVs are written with the origin bottom left, as OBJ has it; colours behind the position, as sRGB, which is how they
+    are read.
     """
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: PbrMaterial
-    normals: np.ndarray | None = None
-    uv: np.ndarray | None = None
-    colours: np.ndarray | None = None
 
 
 def obj_files(meshes: list[ObjMesh], name: str = "asset") -> dict[str, bytes]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.extraction.tet_grid import EDGE_SLOTS, TetGrid
+from fd_mitsuba.fields.index_spaces import BoxEdges, BoxVertices, GridEdges, GridVertices
 
 
 class LatticeBox:
@@ -21,31 +22,32 @@ class LatticeBox:
         vertices: (M,) int64, the grid's numbers of the box's vertices, ascending.
     """
 
-    def __init__(self, grid: TetGrid, index: Tensor) -> None:
+    def __init__(self, grid: TetGrid, index: GridVertices) -> None:
         self._grid = grid
-        self._low, self.shape = (0, 0, 0), (0, 0, 0)
+        self._low: tuple[int, int, int] = (0, 0, 0)
+        self.shape: tuple[int, int, int] = (0, 0, 0)
         if len(index):
             ranges = [(int(c.min()) - 1, int(c.max()) + 2) for c in reversed(grid.coordinates(index))]
             self._low = (ranges[0][0], ranges[1][0], ranges[2][0])
             self.shape = tuple(high - low for low, high in ranges)  # type: ignore[assignment]
-        self.vertices = self.cut(torch.arange(grid.count)).reshape(-1)
+        self.vertices = GridVertices(self.cut(torch.arange(grid.count)).reshape(-1))
 
     def cut(self, values: Tensor) -> Tensor:
         """The box's share, (z, y, x), of one value per vertex of the grid, (count,)."""
         (z, y, x), (depth, height, width) = self._low, self.shape
         return values.view((self._grid.side,) * 3)[z : z + depth, y : y + height, x : x + width]
 
-    def local(self, index: Tensor) -> Tensor:
+    def local(self, index: GridVertices) -> BoxVertices:
         """The box's numbers of the grid's vertices `index` (M,), all of them in the box."""
         x, y, z = self._grid.coordinates(index)
         _, height, width = self.shape
-        return ((z - self._low[0]) * height + (y - self._low[1])) * width + (x - self._low[2])
+        return BoxVertices(((z - self._low[0]) * height + (y - self._low[1])) * width + (x - self._low[2]))
 
-    def grid_edges(self, edges: Tensor) -> Tensor:
+    def grid_edges(self, edges: BoxEdges) -> GridEdges:
         """The grid's numbers of the box's edges (E,); ascending stays ascending."""
-        return self.vertices[edges >> 3] * EDGE_SLOTS + (edges & (EDGE_SLOTS - 1))
+        return GridEdges(self.vertices[edges >> 3] * EDGE_SLOTS + (edges & (EDGE_SLOTS - 1)))
 
-    def unique(self, local: Tensor) -> tuple[Tensor, Tensor]:
+    def unique(self, local: BoxVertices) -> tuple[BoxVertices, Tensor]:
         """The box's numbers `local` (M,) ascending without repeats, and the place of each there.
 
         Linear in the box's size, where sorting is not.
@@ -55,7 +57,7 @@ class LatticeBox:
         present = torch.from_numpy(np.flatnonzero(marks))
         place_of = torch.empty(len(marks), dtype=torch.int64)
         place_of.index_copy_(0, present, torch.arange(len(present)))
-        return present, place_of.index_select(0, local)
+        return BoxVertices(present), place_of.index_select(0, local)
 
 
 def touched_cells(marked: Tensor) -> Tensor:

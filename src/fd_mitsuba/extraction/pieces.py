@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import ndimage
 
@@ -13,4 +15,5 @@ _NEIGHBOURS = _UPWARDS | _UPWARDS[::-1, ::-1, ::-1]
 
 def label_pieces(marked: np.ndarray) -> tuple[np.ndarray, int]:
     """The number (z, y, x) of each marked vertex's piece, from 1 on, and how many there are; 0 where not marked."""
-    return ndimage.label(marked, _NEIGHBOURS)
+    found: Any = ndimage.label(marked, _NEIGHBOURS)  # its annotations leave all that it can return
+    return found

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from fd_mitsuba.extraction.marching_tets import true_positions
 from fd_mitsuba.fields.change_bound import ChangeBound
+from fd_mitsuba.fields.index_spaces import Sites
 from fd_mitsuba.fields.lattice_sites import SiteFeatures
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.fields.union import soft_union
@@ -43,7 +44,7 @@ class SiteSigns:
         self._keeps_until = torch.full((len(sdf_base),), -torch.inf, dtype=torch.float64)
 
     @torch.no_grad()
-    def update(self, field: PartField, features: SiteFeatures) -> Tensor:
+    def update(self, field: PartField, features: SiteFeatures) -> Sites:
         """Looks at the sites whose signs may have changed since the last call, and returns which (N,), ascending.
 
         The soft union never changes by more than the part. With `union_only_outside` it leaps where the part's own
@@ -58,7 +59,7 @@ class SiteSigns:
             self._spent += moved
         else:  # also what is no number
             self._keeps_until.fill_(-torch.inf)
-        due = true_positions(self._keeps_until <= self._spent)
+        due = Sites(true_positions(self._keeps_until <= self._spent))
         part = field.site_sdf(features, due, self._initial.index_select(0, due))
         union = soft_union(self._base.index_select(0, due), part, self._union_k, self._only_outside)
         away = union.abs()

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
 
 
@@ -35,7 +36,7 @@ class SubtractionExtractor(SurfaceExtractor):
         """The remaining base's surface, counter-clockwise seen from outside; see `SurfaceExtractor.__call__`."""
         return _turned(super().__call__(field, samples))
 
-    def extract_plain(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+    def extract_plain(self, field: PartField, samples: GridVertices | None = None) -> UnionSurface:
         """The same surface, vertices in another order, from the field at all vertices and all tetrahedra."""
         return _turned(super().extract_plain(field, samples))
 

@@ -9,6 +9,16 @@ Only *active* vertices of the grid, those near the focal regions, know the part;
 3. joins the result with the base's triangles into one welded mesh.
 
 `SurfaceExtractor.extract_plain` does the same the long way round and is the oracle of the tests.
+
+What a surface is put together from (`fields.index_spaces` has the numbers of vertices and edges):
+
+    vertices   | static: on edges without an active end | on edges of the box with one |
+               | the base's own, never move             | made anew each step          |
+    faces      | static: of cells that touch no active vertex | of the box's other cells, anew each step |
+
+    crossed edge (box) --+-- both ends no site: it is among the static ones, found by its number in the grid
+                         +-- else: its two ends --> sites --> rows of `PartValues`, one row for a site however
+                                                    many edges end there; an end that is no site has the base's values
 """
 
 from __future__ import annotations
@@ -17,6 +27,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from fd_mitsuba.extraction.lattice_box import LatticeBox, touched_cells
@@ -30,6 +41,7 @@ from fd_mitsuba.extraction.marching_tets import (
 )
 from fd_mitsuba.extraction.site_signs import SiteSigns
 from fd_mitsuba.extraction.tet_grid import EDGE_SLOTS, TetGrid
+from fd_mitsuba.fields.index_spaces import BoxEdges, BoxVertices, GridEdges, GridVertices, Sites
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.part_sdf import PartField, PartValues
 from fd_mitsuba.fields.union import soft_union
@@ -38,8 +50,10 @@ FAR_OUTSIDE = -10.0
 """`sdf_part` where it is not evaluated: below any base sdf by more than any fillet, so that the union is the base."""
 
 _OFFSET_CELLS = 0.5
+"""How far an offset may move a vertex along each axis, in cells: two neighbours cannot pass each other."""
 
-Samples = Tensor | Callable[[Tensor], Tensor]
+Samples = GridVertices | Callable[[Tensor], GridVertices]
+"""Active vertices, or what chooses them; see `SurfaceExtractor.__call__`."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +69,11 @@ class UnionSurface:
         sample_sdf: (S,) `sdf_part` at the samples that the caller asked for; gradients flow.
     """
 
-    vertices: Tensor
-    faces: Tensor
-    part_weight: Tensor
-    face_is_part: Tensor
-    sample_sdf: Tensor
+    vertices: Float[Tensor, "V 3"]
+    faces: Int64[Tensor, "F 3"]
+    part_weight: Float[Tensor, " V"]
+    face_is_part: Bool[Tensor, " F"]
+    sample_sdf: Float[Tensor, " S"]
 
 
 class SurfaceExtractor:
@@ -86,7 +100,7 @@ class SurfaceExtractor:
         grid: TetGrid,
         sdf_base: Tensor,
         initial_sdf: Tensor,
-        active_index: Tensor,
+        active_index: GridVertices,
         union_k: float = 0.15,
         union_only_outside: bool = False,
         depth: float | None = None,
@@ -94,13 +108,14 @@ class SurfaceExtractor:
         self.grid = grid
         self.sdf_base = sdf_base.detach()
         self.initial_sdf = initial_sdf.detach()
-        self.active_index = active_index[~grid.is_border(active_index)].unique()
+        self.active_index = GridVertices(active_index[~grid.is_border(active_index)].unique())
         self.union_k = union_k
         self.union_only_outside = union_only_outside
         self._depth = depth
-        self._shape = (grid.side,) * 3
+        self._shape = (grid.side, grid.side, grid.side)
         self.movable = away_from_crossings(self.sdf_base.view(self._shape)).view(-1)[self.active_index]
-        self._reach = _OFFSET_CELLS * grid.spacing * self._mark(self.active_index[self.movable]).to(sdf_base.dtype)
+        movable = GridVertices(self.active_index[self.movable])
+        self._reach = _OFFSET_CELLS * grid.spacing * self._mark(movable).to(sdf_base.dtype)
         self._box = LatticeBox(grid, self.active_index)
         self._active = self._mark(self.active_index)
         self._box_cells = touched_cells(self._box.cut(self._active))
@@ -128,10 +143,10 @@ class SurfaceExtractor:
         is_fixed = (self._box_site.index_select(0, lower) < 0) & (self._box_site.index_select(0, upper) < 0)
         fixed, free = true_positions(is_fixed), true_positions(~is_fixed)
         places = torch.empty(len(edges), dtype=torch.int64)
-        places[fixed] = torch.searchsorted(self._static_edges, self._box.grid_edges(edges[fixed]))
+        places[fixed] = torch.searchsorted(self._static_edges, self._box.grid_edges(BoxEdges(edges[fixed])))
         lower, upper = lower.index_select(0, free), upper.index_select(0, free)
         places.index_copy_(0, free, torch.arange(len(lower)) + len(self._static_edges))
-        ends, position = self._box.unique(torch.cat([lower, upper]))
+        ends, position = self._box.unique(BoxVertices(torch.cat([lower, upper])))
         values, end_sites, sample_sdf = self._values_with_gradient(field, sites, features, ends, samples)
         vertices, part_weight = self._surface_vertices(ends, values, end_sites, position.view(2, -1))
         part_weight = torch.cat([part_weight.new_zeros(len(self._static_vertices)), part_weight])
@@ -140,9 +155,9 @@ class SurfaceExtractor:
         vertices = torch.cat([self._static_vertices, vertices])
         return UnionSurface(vertices, torch.cat([self._static_faces, faces]), part_weight, is_part, sample_sdf)
 
-    def extract_plain(self, field: PartField, samples: Tensor | None = None) -> UnionSurface:
+    def extract_plain(self, field: PartField, samples: GridVertices | None = None) -> UnionSurface:
         """The same surface, vertices in another order, from the field at all vertices and all tetrahedra."""
-        everything = torch.arange(self.grid.count)
+        everything = GridVertices(torch.arange(self.grid.count))
         everywhere = field.evaluate(self.grid.positions(everything, self.sdf_base.dtype), self.initial_sdf)
         sdf_part = torch.where(self._active, everywhere.sdf, FAR_OUTSIDE)
         union = soft_union(self.sdf_base, sdf_part, self.union_k, self.union_only_outside)
@@ -156,12 +171,12 @@ class SurfaceExtractor:
     def lattice_values(self, field: PartField) -> tuple[Tensor, Tensor]:
         """`sdf_part` (count,), `FAR_OUTSIDE` where there is none, and the moved vertices (count, 3); no gradients."""
         sites, features = self._site_features(field)
-        values = field.site_values(sites, features, torch.arange(len(sites)), self._site_initial)
+        values = field.site_values(sites, features, Sites(torch.arange(len(sites))), self._site_initial)
         sdf = self.sdf_base.new_full((self.grid.count,), FAR_OUTSIDE)
         sdf[sites.index] = values.sdf
         offset = sdf.new_zeros(self.grid.count, 3)
         offset[sites.index] = values.offset
-        return sdf, self._moved(torch.arange(self.grid.count), offset)
+        return sdf, self._moved(GridVertices(torch.arange(self.grid.count)), offset)
 
     @torch.no_grad()
     def extract_part(self, field: PartField, other_sdf: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -190,7 +205,7 @@ class SurfaceExtractor:
     def part_sdf(self, field: PartField) -> Tensor:
         """`sdf_part` (A,) at `active_index`, without gradients."""
         sites, features = self._site_features(field)
-        return self._at_active(field.site_sdf(features, torch.arange(len(sites)), self._site_initial))
+        return self._at_active(field.site_sdf(features, Sites(torch.arange(len(sites))), self._site_initial))
 
     def _at_active(self, at_sites: Tensor) -> Tensor:
         return at_sites.index_select(0, self._site_of_active)
@@ -201,8 +216,9 @@ class SurfaceExtractor:
         edges, _ = crossing_faces(inside)
         ends = torch.stack(edge_ends(edges, self._shape))
         still = ~self._active[ends].any(dim=0)
-        self._static_edges = edges[still]
+        self._static_edges = GridEdges(edges[still])
         used, position = ends[:, still].unique(return_inverse=True)
+        used = GridVertices(used)
         base = self.sdf_base[used]
         positions = self.grid.positions(used, base.dtype)
         self._static_vertices, _ = self._on_edges(positions, base, base, position)
@@ -211,30 +227,36 @@ class SurfaceExtractor:
         self._static_is_part = torch.zeros(len(faces), dtype=torch.bool)
 
     def _site_features(self, field: PartField) -> tuple[LatticeSites, SiteFeatures]:
-        if self._sites is None:
+        if self._sites is None:  # the field's layout is known only now; everything here is constant from then on
             self._sites = field.sites(self.grid.axis, self.active_index)
             self._site_initial = self.initial_sdf[self._sites.index]
             self._site_box = self._box.local(self._sites.index)
             self._box_site = torch.full((len(self._box.vertices),), -1, dtype=torch.int32)
             self._box_site[self._site_box] = torch.arange(len(self._sites), dtype=torch.int32)
-            self._site_of_active = self._box_site[self._box.local(self.active_index)].long()
+            self._site_of_active = Sites(self._box_site[self._box.local(self.active_index)].long())
             base = self.sdf_base[self._sites.index]
             self._signs = SiteSigns(base, self._site_initial, self.union_k, self.union_only_outside, self._depth)
         return self._sites, field.site_features(self._sites)
 
-    def _crossings(self, changed: Tensor) -> tuple[Tensor, Tensor]:
+    def _crossings(self, changed: Sites) -> tuple[BoxEdges, Tensor]:
         """The crossed edges, in the box's numbers, and the faces of its cells that touch a site.
 
         Args:
             changed: (N,) the sites whose signs may be others than at the last call.
         """
         if len(self._site_box) == 0:
-            return self._static_edges[:0], self._static_faces[:0]
+            return BoxEdges(self._static_edges[:0]), self._static_faces[:0]
         self._box_inside.view(-1)[self._site_box[changed]] = self._signs.inside[changed]
-        return crossing_faces(self._box_inside, self._box_cells, self._lookup)
+        edges, faces = crossing_faces(self._box_inside, self._box_cells, self._lookup)
+        return BoxEdges(edges), faces
 
     def _values_with_gradient(
-        self, field: PartField, sites: LatticeSites, features: SiteFeatures, ends: Tensor, samples: Tensor | None
+        self,
+        field: PartField,
+        sites: LatticeSites,
+        features: SiteFeatures,
+        ends: BoxVertices,
+        samples: GridVertices | None,
     ) -> tuple[PartValues, Tensor, Tensor]:
         """The field at the sites among `ends` and `samples` (one evaluation), and where each of them is in it.
 
@@ -244,20 +266,20 @@ class SurfaceExtractor:
         sample_sites = end_sites[:0] if samples is None else self._box_site[self._local_samples(samples)].long()
         wanted = torch.zeros(len(sites) + 1, dtype=torch.bool)
         wanted.numpy()[torch.cat([end_sites, sample_sites]).numpy()] = True  # ends that are no site mark the last entry
-        chosen = true_positions(wanted[:-1])
+        chosen = Sites(true_positions(wanted[:-1]))
         position = torch.full((len(sites) + 1,), -1, dtype=torch.int64)  # the last entry serves ends that are no site
         position.index_copy_(0, chosen, torch.arange(len(chosen)))
         values = field.site_values(sites, features, chosen, self._site_initial.index_select(0, chosen))
         end_values = torch.from_numpy(position.numpy()[end_sites.numpy()])  # several times as fast as torch
         return values, end_values, values.sdf.index_select(0, position[sample_sites])
 
-    def _local_samples(self, samples: Tensor) -> Tensor:
+    def _local_samples(self, samples: GridVertices) -> BoxVertices:
         if not self._active[samples].all():
             raise ValueError("samples must be taken from active_index")
         return self._box.local(samples)
 
     def _surface_vertices(
-        self, ends: Tensor, values: PartValues, end_values: Tensor, edges: Tensor
+        self, ends: BoxVertices, values: PartValues, end_values: Tensor, edges: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Vertices and part_weight on `edges` (2, E), pairs of places in `ends` (M,), which are numbers in the box.
 
@@ -272,10 +294,10 @@ class SurfaceExtractor:
         moved = self._box_positions.index_select(0, ends) + offset * self._box_reach.index_select(0, ends)
         return self._on_edges(moved, union, sdf_part - base, edges)
 
-    def _mark(self, index: Tensor) -> Tensor:
+    def _mark(self, index: GridVertices) -> Tensor:
         return torch.zeros(self.grid.count, dtype=torch.bool).index_fill_(0, index, True)
 
-    def _moved(self, index: Tensor, offset: Tensor) -> Tensor:
+    def _moved(self, index: GridVertices, offset: Tensor) -> Tensor:
         """Positions of the grid's vertices after the offsets, (M, 3); those that must not move are exact."""
         return self.grid.positions(index, offset.dtype) + offset * self._reach[index, None].to(offset.dtype)
 

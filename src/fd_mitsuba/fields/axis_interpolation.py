@@ -34,8 +34,10 @@ def axis_matrix(grid: HashGrid, level: int, coordinate: Tensor) -> tuple[Tensor,
 
 def band_of(matrix: Tensor | None, top: int, bottom: int) -> tuple[int, int, Tensor | None]:
     """The columns of these rows that are not all 0, as first, one after the last, and what is between."""
-    if matrix is None:
-        return top, bottom, None
+    return (top, bottom, None) if matrix is None else _band(matrix, top, bottom)
+
+
+def _band(matrix: Tensor, top: int, bottom: int) -> tuple[int, int, Tensor]:
     used = (matrix[top:bottom] != 0).any(dim=0).nonzero()[:, 0]
     first, last = int(used[0]), int(used[-1]) + 1
     return first, last, matrix[top:bottom, first:last].contiguous()
@@ -47,7 +49,7 @@ class Banded:
     def __init__(self, matrix: Tensor) -> None:
         count = max(1, round(len(matrix) / _BAND_ROWS))
         cuts = [len(matrix) * number // count for number in range(count + 1)]
-        self._bands = [band_of(matrix, top, bottom) for top, bottom in pairwise(cuts)]
+        self._bands = [_band(matrix, top, bottom) for top, bottom in pairwise(cuts)]
 
     def from_left(self, values: Tensor) -> Tensor:
         """The matrix times each of values (N, columns, K)."""

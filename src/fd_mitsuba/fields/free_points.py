@@ -7,12 +7,13 @@ table is summed in place, level by level, so that each level's rows stay in the 
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fd_mitsuba.fields.hash_grid import HashGrid
 
 
-def features_at(grid: HashGrid, points: Tensor) -> Tensor:
+def features_at(grid: HashGrid, points: Float[Tensor, "N 3"]) -> Float[Tensor, "features N"]:
     """The features (levels * features, N) at canonical points (N, 3), columns as `ColumnMlp` reads them.
 
     Points beyond the grid's cube count as its border. Gradients flow to the table, not to the points.

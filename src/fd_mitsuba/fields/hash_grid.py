@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
@@ -89,7 +90,7 @@ class HashGrid(nn.Module):
         levels = table.split(self.rows, dim=1)
         return torch.cat([level.abs().amax(dim=1) for level in levels])  # ten times as fast as the maximum norm
 
-    def forward(self, positions: Tensor) -> Tensor:
+    def forward(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N features"]:
         """The features (N, levels * features) at canonical positions (N, 3), level after level.
 
         Gradients flow to the table and, piecewise, to the positions.

@@ -11,6 +11,18 @@ results, comes last. It leaves out the box's columns without a site, a third of 
 is cut into slabs for it: a slab reads a few lattice planes of each level only, and its results stay in the cache.
 
 Gradients of vertices that share a row are added one after another in a fixed order, so repeated runs agree.
+
+How the data lies, for one box of sites with C columns, that is lines along z in which there is a site:
+
+    sites          | box 0 . . . . . . . . . . . . . . . | box 1 . . . |     `index`, and the rows of all results
+                   | slab 0 . . . | slab 1 . . . | . . . |                   `_Slab.begin` to `_Slab.end`
+
+    a slab's       column   0   1   2  . .  C-1                              `full`: (features, depth * C); a site is
+    features       z = 0    .   o   o  . .   .                               at z * C + column, which is what
+                   z = 1    .   .   o  . .   o                               `_Slab.inside` holds for each of its sites
+
+    a column       is the line y * width + x of the box: `_Box.columns`; `_Box.spread` leads back
+    a level        (z, y, x) lattice vertices that the box reads, `slots` their rows in the hash grid's table
 """
 
 from __future__ import annotations
@@ -23,6 +35,7 @@ from torch import Tensor
 
 from fd_mitsuba.fields.axis_interpolation import AxisInterpolation, Banded, axis_matrix, band_of
 from fd_mitsuba.fields.hash_grid import HashGrid
+from fd_mitsuba.fields.index_spaces import GridVertices, Sites, TableRows
 
 _SMALLEST_BOX = 32**3
 """Boxes below this number of sites are not split: a box costs about a millisecond whatever its size."""
@@ -38,7 +51,7 @@ class _BoxLevel:
     """Along x and y; None: the identity."""
     shape: tuple[int, int, int]
     """Lattice vertices along z, y, x."""
-    slots: Tensor
+    slots: TableRows
     """(z * y * x) table row of each lattice vertex, int64."""
     in_columns: bool
     """Whether along x and y lattice vertices are sites: then y and x are one, and hold the box's columns only."""
@@ -84,7 +97,7 @@ class SiteFeatures:
     none: Tensor
     slabs: list[tuple[Tensor, Tensor]]
 
-    def columns(self, chosen: Tensor) -> Tensor:
+    def columns(self, chosen: Sites) -> Tensor:
         """Those of the sites `chosen` (S,), ascending: (width, S)."""
         ends = torch.tensor([len(inside) for _, inside in self.slabs], dtype=torch.int64).cumsum(0)
         cuts = [0, *torch.searchsorted(chosen, ends).tolist()]
@@ -108,7 +121,7 @@ class LatticeSites:
         index: the wanted vertices in the order in which features come out (grouped by box).
     """
 
-    def __init__(self, grid: HashGrid, axis: Tensor, index: Tensor) -> None:
+    def __init__(self, grid: HashGrid, axis: Tensor, index: GridVertices) -> None:
         side = len(axis)
         coordinates = torch.stack([index // (side * side), index // side % side, index % side], dim=1)
         self._grid_width, self._features, self._rows = grid.width, grid.features, grid.table.shape[1]
@@ -131,7 +144,7 @@ class LatticeSites:
             slabs = tuple(_slabs(depth, len(columns), inside, begin, along_z))
             self._boxes.append(_Box(height, width, columns, spread, levels, slabs))
             begin += len(local)
-        self.index = torch.cat(chosen) if chosen else index
+        self.index = GridVertices(torch.cat(chosen)) if chosen else index
 
     def __len__(self) -> int:
         return len(self.index)
@@ -164,11 +177,11 @@ class LatticeSites:
             values = values.view(-1, box.height * box.width).index_select(1, box.columns)
         return values.view(self._features, level.shape[0], -1)
 
-    def select(self, table: Tensor, features: SiteFeatures, chosen: Tensor) -> Tensor:
+    def select(self, table: Tensor, features: SiteFeatures, chosen: Sites) -> Tensor:
         """`features.columns(chosen)` of `features(table)`, with gradients to `table`; `chosen` ascending and unique."""
         return _Select.apply(table, features.columns(chosen), chosen, self)
 
-    def scatter_back(self, gradient: Tensor, chosen: Tensor) -> Tensor:
+    def scatter_back(self, gradient: Tensor, chosen: Sites) -> Tensor:
         """The gradient (features, rows) of the table from that of the chosen sites' features (width, S)."""
         total = gradient.new_zeros(self._features, self._rows)
         for box in self._boxes:
@@ -192,7 +205,7 @@ class LatticeSites:
                     total[feature].index_add_(0, level.slots, values[feature])
         return total
 
-    def _planes_back(self, gradient: Tensor, chosen: Tensor, box: _Box, cuts: list[int]) -> list[Tensor]:
+    def _planes_back(self, gradient: Tensor, chosen: Sites, box: _Box, cuts: list[int]) -> list[Tensor]:
         """Each level's gradient (features, lattice planes, C + 1); the last column, of lines without a site, is 0.
 
         Args:
@@ -217,8 +230,13 @@ class LatticeSites:
 
 
 class _Select(torch.autograd.Function):
+    """Hands on `columns`, which were computed without gradients, as what they are: features that follow from `table`.
+
+    So that all sites can be looked at in every step, and only the few that a loss reaches cost a backward pass.
+    """
+
     @staticmethod
-    def forward(ctx, table: Tensor, columns: Tensor, chosen: Tensor, sites: LatticeSites) -> Tensor:  # type: ignore[override]
+    def forward(ctx, table: Tensor, columns: Tensor, chosen: Sites, sites: LatticeSites) -> Tensor:  # type: ignore[override]
         ctx.sites = sites
         ctx.save_for_backward(chosen)
         return columns
@@ -262,7 +280,7 @@ def _box_level(grid: HashGrid, level: int, axes: list[Tensor], columns: Tensor) 
         slots = slots[:, columns]
     slots = slots.reshape(-1) + grid.first_row[level]
     shape = (len(keys[2]), len(keys[1]), len(keys[0]))
-    return _BoxLevel((along_x, along_y), shape, slots, in_columns), along_z
+    return _BoxLevel((along_x, along_y), shape, TableRows(slots), in_columns), along_z
 
 
 def _slabs(depth: int, columns: int, inside: Tensor, begin: int, along_z: Sequence[Tensor | None]) -> Iterator[_Slab]:

@@ -51,9 +51,12 @@ class _Perceptron(torch.autograd.Function):
         pieces = [weight_out @ torch.relu_(weight_in @ piece) for piece in columns.split(_PIECE, dim=1)]
         return torch.cat(pieces, dim=1)
 
+    # What `once_differentiable` makes of it takes no keywords, which torch's own signature has.
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, gradient: Tensor
+    ) -> tuple[Tensor | None, ...]:
         columns, weight_in, weight_out = ctx.saved_tensors
         of_columns = torch.empty_like(columns) if ctx.needs_input_grad[0] else None
         of_weight_in, of_weight_out = torch.zeros_like(weight_in), torch.zeros_like(weight_out)

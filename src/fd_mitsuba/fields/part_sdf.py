@@ -12,12 +12,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.fields.hash_grid import HashGrid
+from fd_mitsuba.fields.index_spaces import GridVertices, Sites
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.mlp import ColumnMlp
 
@@ -28,9 +30,9 @@ _PIECE = 1024
 class PartValues(NamedTuple):
     """What the field says at N points."""
 
-    sdf: Tensor
+    sdf: Float[Tensor, " N"]
     """(N,) signed distance of the part, inside positive, canonical units."""
-    offset: Tensor
+    offset: Float[Tensor, "N 3"]
     """(N, 3) in (-1, 1): multiples of the furthest allowed move along each axis, half a cell of the caller's grid."""
 
 
@@ -60,7 +62,7 @@ class PartField(nn.Module):
         )
         self.mlp = ColumnMlp(self.grid.width, settings.hidden, 4, seed + 1)
 
-    def evaluate(self, points: Tensor, initial_sdf: Tensor) -> PartValues:
+    def evaluate(self, points: Float[Tensor, "N 3"], initial_sdf: Float[Tensor, " N"]) -> PartValues:
         """The field at any canonical points (N, 3), point by point; gradients flow to the parameters and the points.
 
         Args:
@@ -69,7 +71,7 @@ class PartField(nn.Module):
         """
         return self._values(self.mlp(self.grid(points).t()), initial_sdf)
 
-    def sites(self, axis: Tensor, index: Tensor) -> LatticeSites:
+    def sites(self, axis: Tensor, index: GridVertices) -> LatticeSites:
         """Constants that make `index` (A,) of a cubic lattice with coordinates `axis` (n,) fast to evaluate."""
         return LatticeSites(self.grid, axis, index)
 
@@ -78,14 +80,14 @@ class PartField(nn.Module):
         return sites.features(self.grid.table)
 
     @torch.no_grad()
-    def site_sdf(self, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor) -> Tensor:
+    def site_sdf(self, features: SiteFeatures, chosen: Sites, initial_sdf: Tensor) -> Tensor:
         """`sdf_part` (S,) at some sites, without gradients; the arguments are those of `site_values`."""
         columns = pad(features.columns(chosen), (0, -len(chosen) % _PIECE))
         rows = torch.cat([self.mlp.first_output(piece) for piece in columns.split(_PIECE, dim=1)])
         return initial_sdf + rows[: len(chosen)]
 
     def site_values(
-        self, sites: LatticeSites, features: SiteFeatures, chosen: Tensor, initial_sdf: Tensor
+        self, sites: LatticeSites, features: SiteFeatures, chosen: Sites, initial_sdf: Tensor
     ) -> PartValues:
         """The field at some sites, with gradients to the parameters.
 

@@ -13,6 +13,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from fd_mitsuba.config.sections import TextureConfig
@@ -30,16 +31,16 @@ _MARGIN = 0.03
 class TextureValues:
     """A material at N points."""
 
-    base_color: Tensor
+    base_color: Float[Tensor, "N 3"]
     """(N, 3) linear, in the configured range."""
-    roughness: Tensor
+    roughness: Float[Tensor, "N 1"]
     """(N, 1) as `principled` means it: its microfacet alpha is the square."""
-    metallic: Tensor
+    metallic: Float[Tensor, "N 1"]
     """(N, 1)."""
-    normal: Tensor
+    normal: Float[Tensor, "N 3"]
     """(N, 3) unit normal in the tangent frame of the shading normal, which is (0, 0, 1)."""
 
-    def style(self) -> Tensor:
+    def style(self) -> Float[Tensor, "N 5"]:
         """(N, 5) kd and krm: what style consistency compares."""
         return torch.cat([self.base_color, self.roughness, self.metallic], dim=1)
 
@@ -88,7 +89,7 @@ class TextureField(nn.Module):
         self._fixed = torch.tensor(fixed)[:, None]
         self._steepest = math.tan(math.radians(config.max_tilt_deg))
 
-    def forward(self, points: Tensor) -> TextureValues:
+    def forward(self, points: Float[Tensor, "N 3"]) -> TextureValues:
         """The material at canonical points (N, 3). Gradients flow to the weights, not to the points."""
         rows = self.mlp(features_at(self.grid, points))
         dtype = rows.dtype

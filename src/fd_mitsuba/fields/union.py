@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def soft_union(sdf_base: Tensor, sdf_part: Tensor, k: float, only_outside: bool = False) -> Tensor:
+def soft_union(
+    sdf_base: Float[Tensor, "*points"], sdf_part: Float[Tensor, "*points"], k: float, only_outside: bool = False
+) -> Float[Tensor, "*points"]:
     """The signed distance of base and part together, with a fillet of width `k` where their surfaces meet.
 
         soft_union = max(sdf_base, sdf_part) + 0.1 h^2 / k,   h = max(k - |sdf_base - sdf_part|, 0)
@@ -31,7 +34,9 @@ def soft_union(sdf_base: Tensor, sdf_part: Tensor, k: float, only_outside: bool 
     return larger + 0.1 / k * overlap * overlap
 
 
-def soft_subtract(sdf_base: Tensor, sdf_part: Tensor, k: float) -> Tensor:
+def soft_subtract(
+    sdf_base: Float[Tensor, "*points"], sdf_part: Float[Tensor, "*points"], k: float
+) -> Float[Tensor, "*points"]:
     """The signed distance of the base without the part, with a fillet of width `k` along the edge of the cut.
 
         soft_subtract = min(sdf_base, -sdf_part) - 0.1 h^2 / k,   h = max(k - |sdf_base + sdf_part|, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -20,7 +21,7 @@ def shine(roughness: Values, metallic: Values) -> Values:
     return (4 * metallic + 1 - roughness) / 5
 
 
-def colour_latents(pictures: Tensor, size: int) -> Tensor:
+def colour_latents(pictures: Float[Tensor, "N 4 H W"], size: int) -> Float[Tensor, "N 4 {size} {size}"]:
     """(N, 4, size, size), 2 mean - 1, of pictures (N, 4, H, W) in [0, 1]: sRGB, and shine times the part's coverage.
 
     Nothing is divided by coverage: black stays black. Gradients flow. A picture of 32 x 32 pixels says little about

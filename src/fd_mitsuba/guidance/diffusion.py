@@ -19,6 +19,7 @@ from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
+from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.denoiser import Denoiser
@@ -61,7 +62,7 @@ class DiffusionGuidance(Denoiser):
                 f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
             )
         self.view_grid = components.conventions.view_grid
-        self.normal_space = components.conventions.normal_space
+        self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
         self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None
@@ -297,7 +298,9 @@ class DiffusionGuidance(Denoiser):
             cause = "the light or a material gives no number" if phase == "appearance" else "the surface has broken"
             raise NonFiniteGuidance(f"the pictures rendered for the {phase} phase are not finite; {cause}")
         images = tile_views(pictures, self.view_grid).to(self.device)
-        return images, tile_views(base, self.view_grid).to(self.device).detach() if self.needs_base else None
+        if base is None or not self.needs_base:
+            return images, None
+        return images, tile_views(base, self.view_grid).to(self.device).detach()
 
     def _condition(self, base: Tensor | None, holes: Tensor | None, rows: slice, phase: Phase) -> Tensor | None:
         """What the network sees of the base beside z_t, for some of the pictures."""

@@ -6,13 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
 
-from fd_mitsuba.conventions import GEOMETRY_CHANNELS
+from fd_mitsuba.conventions import GEOMETRY_CHANNELS, NormalSpace
 from fd_mitsuba.errors import RunStopped
 
 Phase = Literal["coarse", "refined", "appearance"]
 """What the pictures of a step are: normals at the size of the latents, normals at full size, colours."""
+
+Angles = Sequence[float] | np.ndarray
+"""One for each view, degrees."""
 
 
 class NonFiniteGuidance(RunStopped):
@@ -37,8 +41,8 @@ class GuidanceViews:
 
     pictures: torch.Tensor
     base: torch.Tensor | None
-    azimuth_deg: Sequence[float]
-    elevation_deg: Sequence[float]
+    azimuth_deg: Angles
+    elevation_deg: Angles
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
     share: slice | None = None
@@ -73,8 +77,8 @@ class AppearanceViews:
     mask: torch.Tensor
     part_mask: torch.Tensor
     shine: torch.Tensor
-    azimuth_deg: Sequence[float]
-    elevation_deg: Sequence[float]
+    azimuth_deg: Angles
+    elevation_deg: Angles
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
     share: slice | None = None
@@ -113,16 +117,27 @@ class Guidance(Protocol):
 
     Optional, for scenes whose focal regions have prompts: `set_part_prompts(prompts)` takes part -> (prompt, negative
     prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
+
+    Properties here may be plain attributes of a class: nothing writes to them.
     """
 
-    needs_base: bool
-    """Whether `GuidanceViews.base` must be given."""
-    view_grid: int
-    """Pictures are mosaics of view_grid x view_grid views; the number of views must be a multiple of its square.
+    @property
+    def needs_base(self) -> bool:
+        """Whether `GuidanceViews.base` must be given."""
+        ...
 
-    The views of a mosaic are consecutive, and view i looks from azimuth_deg[0] + 360 i / view_grid^2."""
-    normal_space: Literal["camera", "world"] | None
-    """Frame of the normals that the model was trained with; None: either will do."""
+    @property
+    def view_grid(self) -> int:
+        """Pictures are mosaics of view_grid x view_grid views; the number of views must be a multiple of its square.
+
+        The views of a mosaic are consecutive, and view i looks from azimuth_deg[0] + 360 i / view_grid^2.
+        """
+        ...
+
+    @property
+    def normal_space(self) -> NormalSpace | None:
+        """Frame of the normals that the model was trained with; None: either will do."""
+        ...
 
     def picture_size(self, phase: Phase) -> int:
         """Height and width in pixels at which the views of a phase must be rendered."""
@@ -146,10 +161,15 @@ class AppearanceGuidance(Protocol):
     Optional, beside what `Guidance` names: `control_sees`, `depth` or `normal`, asks for `AppearanceViews.control`.
     """
 
-    needs_base: bool
-    """Whether `AppearanceViews.condition` must be given."""
-    view_grid: int
-    """As `Guidance.view_grid`."""
+    @property
+    def needs_base(self) -> bool:
+        """Whether `AppearanceViews.condition` must be given."""
+        ...
+
+    @property
+    def view_grid(self) -> int:
+        """As `Guidance.view_grid`."""
+        ...
 
     @property
     def appearance_size(self) -> int:

@@ -37,12 +37,15 @@ HUB_FILES = ["model_index.json", FILE_NAME, "tokenizer/*", "scheduler/*.json"] +
 
 @dataclass(frozen=True)
 class Components:
-    """The parts of a pipeline, in evaluation mode, without gradients in the weights."""
+    """The parts of a pipeline, in evaluation mode, without gradients in the weights.
+
+    `Any`, since each is of one of several classes, whose `config` the libraries make up while they load.
+    """
 
     tokenizer: Any
-    text_encoder: torch.nn.Module
-    unet: torch.nn.Module
-    vae: torch.nn.Module
+    text_encoder: Any
+    unet: Any
+    vae: Any
     scheduler: Any
     conventions: ModelConventions
     folder: Path
@@ -146,19 +149,21 @@ def _load(
             f"{folder / 'model_index.json'}: unknown scheduler {index['scheduler'][1]}; name a DDIMScheduler"
         )
     loaded: dict[str, Any] = {}
-    for part, owner, kind in (
+    wanted: tuple[tuple[str, Any, torch.dtype], ...] = (
         ("unet", diffusers.UNet2DConditionModel, dtype),
         ("vae", getattr(diffusers, index["vae"][1]), torch.float32),
         ("text_encoder", transformers.CLIPTextModel, dtype if on_cpu else torch.float32),
-    ):
+    )
+    for part, network_class, kind in wanted:
+        owner: Any = network_class
         key = "torch_dtype" if part != "text_encoder" else "dtype"
         model = _network(owner, folder / part, variants[part], **{key: kind})
         loaded[part] = model.to("cpu" if part == "text_encoder" else device)
     with _one_line(folder / "tokenizer"), _quiet():
         # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
-        kind = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
-        tokenizer = kind.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
+        owner = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
+        tokenizer = owner.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
     known = loaded["text_encoder"].config.vocab_size
     if len(tokenizer) > known:
         raise UserError(

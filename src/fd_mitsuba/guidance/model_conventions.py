@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 
@@ -22,7 +23,7 @@ class ModelConventions(BaseModel):
 
     view_grid: Annotated[int, Field(ge=1, le=4)] = 1
     """Pictures are mosaics of view_grid x view_grid views, row by row from the top left, azimuths evenly spread."""
-    normal_space: Literal["camera", "world"] | None = None
+    normal_space: NormalSpace | None = None
     """Frame of the normals in the training pictures; None: the weights do not care."""
     needs_base: bool | None = None
     """If given, must agree with the UNet: 8 and 9 input channels take the base's picture as condition, 4 do not."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 
-def tile_views(pictures: Tensor, grid: int) -> Tensor:
+def tile_views(pictures: Float[Tensor, "B C H W"], grid: int) -> Float[Tensor, "M C gridH gridW"]:
     """Mosaics (B / grid^2, C, grid H, grid W) of consecutive pictures (B, C, H, W), row by row from the top left.
 
     Gradients flow. `grid` 1 returns the pictures as they are.

@@ -71,7 +71,7 @@ class TextEmbeddings:
     def __init__(
         self,
         tokenizer: Any,
-        text_encoder: torch.nn.Module,
+        text_encoder: Any,
         device: torch.device | str | None = None,
         words: Mapping[str, str] | None = None,
     ) -> None:

@@ -7,9 +7,10 @@ Latents are (N, C, H, W); everything per timestep is (N,) and is broadcast here.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, assert_never
 
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from fd_mitsuba.conventions import Weighting
@@ -18,12 +19,15 @@ PredictionType = Literal["epsilon", "v_prediction", "sample"]
 Annealing = Literal["linear", "sqrt"]
 _LEAST_LEVEL = 1e-12
 
+Latents = Float[Tensor, "N C H W"]
+PerLatent = Float[Tensor, " N"]
 
-def _per_latent(values: Tensor) -> Tensor:
+
+def _per_latent(values: PerLatent) -> Float[Tensor, "N 1 1 1"]:
     return values.view(-1, 1, 1, 1)
 
 
-def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
+def weight(weighting: Weighting, alpha_bar: PerLatent) -> PerLatent:
     """w(t), which the paper leaves open, for each alpha_bar.
 
     `sds`: 1 - alpha_bar (DreamFusion); `uniform`: 1; `fantasia3d`: sqrt(alpha_bar) (1 - alpha_bar);
@@ -39,10 +43,12 @@ def weight(weighting: Weighting, alpha_bar: Tensor) -> Tensor:
         return 1 / (1 - alpha_bar)
     if weighting == "ism":
         return ((1 - alpha_bar) / alpha_bar).sqrt()
-    raise ValueError(f"unknown weighting {weighting!r}")
+    assert_never(weighting)
 
 
-def draw_timesteps(bounds: tuple[float, float], train_timesteps: int, count: int, generator: torch.Generator) -> Tensor:
+def draw_timesteps(
+    bounds: tuple[float, float], train_timesteps: int, count: int, generator: torch.Generator
+) -> Int64[Tensor, " N"]:
     """`count` timesteps (int64, CPU), t ~ U[t_0, t_final] (paper, supplement "Score Distillation Sampling Settings").
 
     `bounds` are fractions of the scheduler's training timesteps; the draw is kept inside [1, train_timesteps - 1].
@@ -55,7 +61,7 @@ def draw_timesteps(bounds: tuple[float, float], train_timesteps: int, count: int
 
 def scheduled_timesteps(
     bounds: tuple[float, float], train_timesteps: int, count: int, annealing: Annealing, progress: float
-) -> Tensor:
+) -> Int64[Tensor, " N"]:
     """`count` times the one timestep (int64, CPU) that is due at `progress` in [0, 1]; nothing is random.
 
         linear: t = high - (high - low) progress           (DreamTime, arXiv 2306.12422, with an even weight)
@@ -69,13 +75,13 @@ def scheduled_timesteps(
     return torch.full((count,), min(max(due, 1), train_timesteps - 1))
 
 
-def add_noise(z: Tensor, noise: Tensor, alpha_bar: Tensor) -> Tensor:
+def add_noise(z: Latents, noise: Latents, alpha_bar: PerLatent) -> Latents:
     """z_t = sqrt(alpha_bar) z + sqrt(1 - alpha_bar) e (DDPM's forward process)."""
     abar = _per_latent(alpha_bar)
     return abar.sqrt() * z + (1 - abar).sqrt() * noise
 
 
-def noise_from_prediction(prediction: Tensor, z_t: Tensor, alpha_bar: Tensor, kind: PredictionType) -> Tensor:
+def noise_from_prediction(prediction: Latents, z_t: Latents, alpha_bar: PerLatent, kind: PredictionType) -> Latents:
     """The noise e_hat that a network's output stands for.
 
     v = sqrt(alpha_bar) e - sqrt(1 - alpha_bar) z  gives  e = sqrt(alpha_bar) v + sqrt(1 - alpha_bar) z_t
@@ -88,10 +94,10 @@ def noise_from_prediction(prediction: Tensor, z_t: Tensor, alpha_bar: Tensor, ki
         return abar.sqrt() * prediction + (1 - abar).sqrt() * z_t
     if kind == "sample":
         return (z_t - abar.sqrt() * prediction) / (1 - abar).sqrt()
-    raise ValueError(f"unknown prediction type {kind!r}")
+    assert_never(kind)
 
 
-def clean_estimate(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor) -> Tensor:
+def clean_estimate(z_t: Latents, noise_hat: Latents, alpha_bar: PerLatent) -> Latents:
     """z_hat = (z_t - sqrt(1 - alpha_bar) e_hat) / sqrt(alpha_bar): the clean latents that e_hat implies.
 
     Near alpha_bar = 0 this is the difference of two numbers that are nearly the same: see `levels`.
@@ -137,29 +143,29 @@ def _nonzero(coefficients: dict[str, float]) -> dict[str, float]:
     return {name: value for name, value in coefficients.items() if value != 0}
 
 
-def combine(predictions: dict[str, Tensor], coefficients: dict[str, float]) -> Tensor:
+def combine(predictions: dict[str, Tensor], coefficients: dict[str, float]) -> Latents:
     """Sum of coefficient times prediction over the passes that `coefficients` names."""
     return sum(value * predictions[name] for name, value in coefficients.items())  # type: ignore[return-value]
 
 
-def perpendicular(other: Tensor, direction: Tensor) -> Tensor:
+def perpendicular(other: Latents, direction: Latents) -> Latents:
     """What of `other` (N, C, H, W) is perpendicular to `direction`, sample by sample: o - (o d / d d) d (Perp-Neg)."""
     inner = (other * direction).sum(dim=(1, 2, 3), keepdim=True)
     square = direction.square().sum(dim=(1, 2, 3), keepdim=True)
     return other - inner / square.clamp(min=torch.finfo(direction.dtype).tiny) * direction
 
 
-def sds_gradient(noise_hat: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
+def sds_gradient(noise_hat: Latents, noise: Latents, weights: PerLatent) -> Latents:
     """w(t) (e_hat - e), with respect to z (paper, section "Preliminary", the SDS equation)."""
     return _per_latent(weights) * (noise_hat - noise)
 
 
-def csd_gradient(noise_text: Tensor, noise_plain: Tensor, weights: Tensor) -> Tensor:
+def csd_gradient(noise_text: Latents, noise_plain: Latents, weights: PerLatent) -> Latents:
     """w(t) (e(text) - e(plain)): only the part of the score that the text explains (classifier score distillation)."""
     return _per_latent(weights) * (noise_text - noise_plain)
 
 
-def reconstruction_gradient(z: Tensor, z_hat: Tensor, weights: Tensor) -> Tensor:
+def reconstruction_gradient(z: Latents, z_hat: Latents, weights: PerLatent) -> Latents:
     """w(t) (z - z_hat): towards the denoised latents (the gradient of w/2 |z - z_hat|^2 with z_hat held fixed).
 
     With z_hat from one denoising step this is SDS with its weight times sqrt((1 - alpha_bar) / alpha_bar).
@@ -167,12 +173,12 @@ def reconstruction_gradient(z: Tensor, z_hat: Tensor, weights: Tensor) -> Tensor
     return _per_latent(weights) * (z - z_hat)
 
 
-def ddim_step(z_t: Tensor, noise_hat: Tensor, alpha_bar: Tensor, alpha_bar_next: Tensor) -> Tensor:
+def ddim_step(z_t: Latents, noise_hat: Latents, alpha_bar: PerLatent, alpha_bar_next: PerLatent) -> Latents:
     """Latents at the next, less noisy level: add_noise(z_hat, e_hat, alpha_bar_next) (DDIM with eta 0)."""
     return add_noise(clean_estimate(z_t, noise_hat, alpha_bar), noise_hat, alpha_bar_next)
 
 
-def normalising_scale(gradient: Tensor, mask: Tensor | None = None) -> float:
+def normalising_scale(gradient: Latents, mask: Float[Tensor, "N 1 H W"] | None = None) -> float:
     """1 / mean |g|: a gradient times this has mean size 1, so that step sizes do not depend on t.
 
     With a mask (N, 1, L, L) of zeros and ones the mean is over its ones; a mask without any gives 1.
@@ -185,7 +191,9 @@ def normalising_scale(gradient: Tensor, mask: Tensor | None = None) -> float:
     return 1 / max(float(size.mean()), torch.finfo(gradient.dtype).tiny)
 
 
-def carry_gradient(inputs: Tensor, gradient: Tensor, value: float) -> Tensor:
+def carry_gradient(
+    inputs: Float[Tensor, "*shape"], gradient: Float[Tensor, "*shape"], value: float
+) -> Float[Tensor, ""]:
     """A scalar with the given value whose gradient with respect to `inputs` is exactly `gradient`.
 
     The same as 0.5 |x - (x - g).detach()|^2, without the rounding of x - (x - g) where g is small beside x.

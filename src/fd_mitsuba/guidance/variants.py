@@ -101,8 +101,11 @@ class Chunk:
 class Network(Protocol):
     """What the variants ask of `denoiser.Denoiser`."""
 
-    has_image_pass: bool
-    alpha_bars: Tensor
+    @property
+    def has_image_pass(self) -> bool: ...
+
+    @property
+    def alpha_bars(self) -> Tensor: ...
 
     def predict_noise(
         self,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 
-def loss_bend(normal: Tensor) -> Tensor:
+def loss_bend(normal: Float[Tensor, "N 3"]) -> Float[Tensor, ""]:
     """Mean over points of `|slope|^2 = tan(angle to the mesh's normal)^2`.
 
     Not in the paper. Under one light, normals that all lean towards it make a part as bright as the guidance likes;

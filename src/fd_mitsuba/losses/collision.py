@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 
-def loss_collision(sdf_base: Tensor, sdf_part: Tensor) -> Tensor:
+def loss_collision(sdf_base: Float[Tensor, " N"], sdf_part: Float[Tensor, " N"]) -> Float[Tensor, ""]:
     """Mean over sample points of `max(sdf_base, 0) * max(sdf_part, 0)`. Paper: L_CA, "Geometry Editing".
 
     Args:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
 def loss_focal(
-    sdf_part: Tensor, distance: Tensor, sigma_distance: float, sigma_sdf: float, margin: float = 0.0
-) -> Tensor:
+    sdf_part: Float[Tensor, " N"],
+    distance: Float[Tensor, " N"],
+    sigma_distance: float,
+    sigma_sdf: float,
+    margin: float = 0.0,
+) -> Float[Tensor, ""]:
     """Mean penalty of points that are inside the part but away from the focal regions.
 
         mean((1 - exp(-distance^2 / sigma_distance)) * tanh(max(sdf_part + margin, 0) / sigma_sdf))

@@ -5,10 +5,13 @@ from __future__ import annotations
 from math import ceil
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def loss_presence(sdf_part: Tensor, members: Tensor, share: float, depth: float) -> Tensor:
+def loss_presence(
+    sdf_part: Float[Tensor, " N"], members: Bool[Tensor, "R N"], share: float, depth: float
+) -> Float[Tensor, ""]:
     """What the deepest points of each focal region lack to lie inside the part, as a mean over regions.
 
         mean over regions of max(depth - mean(the largest `share` of sdf_part in the region), 0)

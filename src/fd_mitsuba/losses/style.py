@@ -7,10 +7,11 @@ is its smoothness term, the second its boundary condition. The paper's L_SC = L_
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def jittered(points: Tensor, deviation: float, generator: torch.Generator) -> Tensor:
+def jittered(points: Float[Tensor, "N 3"], deviation: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """`points + delta` with delta normal in each coordinate: the second place that `loss_style_gradient` compares.
 
     Args:
@@ -21,7 +22,7 @@ def jittered(points: Tensor, deviation: float, generator: torch.Generator) -> Te
     return points + deviation * torch.randn(points.shape, generator=generator, dtype=points.dtype)
 
 
-def loss_style_gradient(here: Tensor, moved: Tensor) -> Tensor:
+def loss_style_gradient(here: Float[Tensor, "N C"], moved: Float[Tensor, "N C"]) -> Float[Tensor, ""]:
     """Mean over points of `|part(x) - part(x + delta)|^2`. Paper: L_g, "Style Consistency".
 
     Deviates: the paper means every channel; callers pass kd and krm, since a normal map may well vary.
@@ -35,7 +36,7 @@ def loss_style_gradient(here: Tensor, moved: Tensor) -> Tensor:
     return _mean_square(here - moved)
 
 
-def loss_style_boundary(part: Tensor, base: Tensor) -> Tensor:
+def loss_style_boundary(part: Float[Tensor, "N C"], base: Float[Tensor, "N C"]) -> Float[Tensor, ""]:
     """Mean over boundary points of `|part(x) - base(x)|^2`. Paper: L_b, "Style Consistency".
 
     Args:

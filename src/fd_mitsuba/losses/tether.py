@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 
-def loss_tether(sdf_part: Tensor, depth: float) -> Tensor:
+def loss_tether(sdf_part: Float[Tensor, " N"], depth: float) -> Float[Tensor, ""]:
     """Mean over points of max(depth - sdf_part, 0): how much they lack to lie `depth` inside the part.
 
     Args:

@@ -144,7 +144,8 @@ class AppearancePass:
             ValueError: a value that the BSDF needs is missing, or has another shape.
         """
         base_path = self.render_base(gbuffer, seed)
-        part_path = self._render_part(gbuffer, self._films(gbuffer, base_color, roughness, metallic, normal), seed)
+        given = {"base_color": base_color, "roughness": roughness, "metallic": metallic}
+        part_path = self._render_part(gbuffer, self._films(gbuffer, given, normal), seed)
         return AppearancePictures(part_path + base_path, part_path, base_path, gbuffer.alpha, gbuffer.part_mask)
 
     def render_base(self, gbuffer: GBuffer, seed: int) -> torch.Tensor:
@@ -190,15 +191,9 @@ class AppearancePass:
         return _as_picture(flat, gbuffer)
 
     def _films(
-        self,
-        gbuffer: GBuffer,
-        base_color: torch.Tensor | None,
-        roughness: torch.Tensor | None,
-        metallic: torch.Tensor | None,
-        normal: torch.Tensor | None,
+        self, gbuffer: GBuffer, given: dict[str, torch.Tensor | None], normal: torch.Tensor | None
     ) -> dict[str, torch.Tensor]:
         """Field -> (B S S, channels), zero where no pixel sees the part: sizes that no step changes."""
-        given = {"base_color": base_color, "roughness": roughness, "metallic": metallic}
         values = {name: given[name] for name in self._shading.fed}
         if normal is not None:
             values["normal"] = normal

@@ -25,8 +25,11 @@ _NOT_RENDERED = ("focal_region", "sensor", "integrator")
 class Triangles(Protocol):
     """A mesh, canonical frame, outward faces: a closed part, or the faces of a cut."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    @property
+    def vertices(self) -> np.ndarray: ...
+
+    @property
+    def faces(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | Non
     if not opened:
         return shapes
     left = []
-    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs().scene), strict=True)):
+    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs.scene), strict=True)):
         path = opened.get(number)
         if path is None:
             left += [shape] * (number not in opened)

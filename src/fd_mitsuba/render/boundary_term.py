@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from fd_mitsuba.backend.upload import upload_floats, upload_indices
+from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.mesh_tracer import Hit
 from fd_mitsuba.render.outline_points import OutlinePoints
-from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, channels, shade_hit
+from fd_mitsuba.render.surface_point import ShadedMesh, channels, shade_hit
 
 _STEP_ASIDE = 1e-6
 """How far outside the outline the background is looked up, as a share of the picture's width.

@@ -19,6 +19,8 @@ import mitsuba as mi
 from fd_mitsuba.render.cameras import FilmCameras
 
 _NOTHING = 2**64 - 1
+"""No face. What a point remembers is one number, the bits of a depth above those of the face's number: the smaller is
+the nearer, since positive floats are in the order of their bits, and at equal depths the face that comes first."""
 _SLACK = 1e-3
 """By how many pixels a face's box is widened: rounding, and points that step across the picture's border."""
 _NEAREST_DEPTH = 1e-3

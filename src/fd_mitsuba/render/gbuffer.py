@@ -165,5 +165,5 @@ def _first_points(
     position, normal = surface.p, surface.sh_frame.n
     place, number = lane // spp, dr.gather(mi.UInt32, part, lane)
     dr.eval(position, normal, place, number)
-    vectors = (torch.stack([bridge.to_torch(axis) for axis in v], dim=1) for v in (position, normal))
-    return *vectors, *(bridge.indices_to_torch(array) for array in (place, number))
+    points, normals = (torch.stack([bridge.to_torch(axis) for axis in v], dim=1) for v in (position, normal))
+    return points, normals, bridge.indices_to_torch(place), bridge.indices_to_torch(number)

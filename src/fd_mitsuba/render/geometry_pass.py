@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import drjit as dr
 import mitsuba as mi
 import torch
 
 from fd_mitsuba.backend import bridge, startup
 from fd_mitsuba.backend.upload import upload_indices
-from fd_mitsuba.conventions import GEOMETRY_CHANNELS
+from fd_mitsuba.conventions import GEOMETRY_CHANNELS, NormalSpace
 from fd_mitsuba.render.boundary_term import add_boundary_term, upload_points
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.enclosing import is_closed, is_outside
@@ -17,7 +19,7 @@ from fd_mitsuba.render.mesh_check import CheckedMesh, check_mesh
 from fd_mitsuba.render.mesh_tracer import Hit, MeshTracer
 from fd_mitsuba.render.outline_points import sample_outline
 from fd_mitsuba.render.silhouette import find_outline
-from fd_mitsuba.render.surface_point import NormalSpace, ShadedMesh, shade_hit
+from fd_mitsuba.render.surface_point import ShadedMesh, shade_hit
 from fd_mitsuba.render.vertex_normals import area_sums, vertex_normals
 from fd_mitsuba.scene.views import CameraBatch
 
@@ -36,13 +38,14 @@ class GeometryPass:
     """
 
     def __init__(self, size: int, spp: int = 4, silhouette_spp: int = 1, normal_space: NormalSpace = "camera") -> None:
-        if size < 1 or spp < 1 or silhouette_spp < 0 or normal_space not in ("camera", "world"):
+        if size < 1 or spp < 1 or silhouette_spp < 0 or normal_space not in get_args(NormalSpace):
             raise ValueError(
                 f"size = {size}, spp = {spp}, silhouette_spp = {silhouette_spp}, normal_space = {normal_space!r}: "
                 "sizes and samples must be positive, normal_space camera or world"
             )
         startup.start(mi.variant() or startup.DEFAULT_VARIANT)
-        self.size, self.spp, self.silhouette_spp, self.normal_space = size, spp, silhouette_spp, normal_space
+        self.size, self.spp, self.silhouette_spp = size, spp, silhouette_spp
+        self.normal_space: NormalSpace = normal_space
         self._tracer = MeshTracer()
         self._static_sums, self._static_sums_build = torch.zeros(0, 3), 0
 

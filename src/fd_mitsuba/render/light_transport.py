@@ -75,6 +75,7 @@ class LightTransport:
     ) -> tuple[Incident, mi.Ray3f, mi.SurfaceInteraction3f]:
         """Both directions at one point, the ray along the sampled one, and what that ray hits."""
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        # True: shadow rays are traced, so that the radiance is 0 where something stands in the way.
         emitter, radiance = self.scene.sample_emitter_direction(surface, numbers.emitter, True, smooth)
         lit = smooth & (emitter.pdf > 0)
         density = bsdf.pdf(self._context, surface, surface.to_local(emitter.d), lit)
@@ -111,6 +112,7 @@ class LightTransport:
         """Radiance that `surface`, seen along `ray`, sends back, without what it emits itself."""
         random = mi.PCG32(initstate=mi.UInt64(stream), initseq=mi.UInt64(stream))
         ray, surface = mi.Ray3f(ray), mi.SurfaceInteraction3f(surface)
+        # Depth counts as in `path`: 1 is what the camera sees, 2 the light there, which the caller has.
         total, carried, depth, active = mi.Color3f(0), mi.Color3f(1), mi.UInt32(2), mi.Bool(active)
         while active:
             bsdf = surface.bsdf(ray)

@@ -10,7 +10,11 @@ Building the ray-tracing hierarchy could cost more than everything else in a pas
   spatial splits, 2.7 microseconds a face, and that of a group without, 0.5 microseconds; rays take the same time and
   see the same.
 
-Both scenes are updated in place: a scene that is loaded anew at every step leaks.
+The scenes are updated in place: one that is loaded anew at every step leaks.
+
+    face number   0 . . . . . static_faces | . . . . . . . . . . . . . . . . . F
+    scene         `_static`, built once    | `_moving`, built when `trace` asks; or none of it (drawn), and
+                                           | `_large`: those few of them that are too large to draw
 """
 
 from __future__ import annotations
@@ -111,19 +115,7 @@ class MeshTracer:
             dr.eval(film, view)
             if dr.width(view) > _POINTS_PER_FACE * len(self._moving_mesh[1]):
                 return self.trace(cameras.at(view).ray(film), coherent=True)
-        return self.draw(cameras, film, view, mesh, from_outside)
-
-    def draw(
-        self,
-        cameras: FilmCameras,
-        film: mi.Point2f,
-        view: mi.UInt32,
-        mesh: tuple[mi.Float, mi.UInt32],
-        from_outside: bool = False,
-    ) -> Hit:
-        """`see` without a hierarchy of the faces that change, of which there must be one at least."""
-        with dr.suspend_grad():
-            dr.eval(film, view)
+            # Drawn: without a hierarchy of the faces that change.
             count = len(self._moving_mesh[1])
             points = sort_points(cameras, film, view)
             drawn = nearest_faces(points, cameras, *mesh, self._static_faces, count, front_only=from_outside)

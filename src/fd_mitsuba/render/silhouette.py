@@ -36,7 +36,7 @@ def find_outline(
     for begin in range(0, cameras.count, _VIEWS_AT_ONCE):
         eyes = cameras.position[begin : begin + _VIEWS_AT_ONCE]
         facing = _facing(positions, triangles, eyes)
-        edges = every or pair_closed(faces, *_where_it_turns(facing, triangles, vertices), vertices)
+        edges = every or pair_closed(faces, *_where_it_turns(facing, triangles, vertices), vertices=vertices)
         edge, view = _turning(np.array(facing), edges, len(eyes))
         parts.append((view + begin, edges.half_a[edge], edges.half_b[edge]))
     view, half_a, half_b = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -61,7 +61,9 @@ def _facing(positions: mi.Float, triangles: mi.UInt32, eyes: np.ndarray) -> mi.U
     return bits
 
 
-def _where_it_turns(facing: mi.UInt32, triangles: mi.UInt32, vertices: int) -> tuple[np.ndarray, ...]:
+def _where_it_turns(
+    facing: mi.UInt32, triangles: mi.UInt32, vertices: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Half-edges of which both ends have faces turned to an eye and away from it: one in ten; start and end; each (H,).
 
     In a closed mesh every edge of an outline is among them, with both its half-edges, so nothing else need be paired.
@@ -77,7 +79,8 @@ def _where_it_turns(facing: mi.UInt32, triangles: mi.UInt32, vertices: int) -> t
     a, b, c = (dr.gather(mi.UInt32, turns, index) for index in triangle)
     face = dr.compress(((a & b) | (b & c) | (c & a)) != 0)
     if not dr.width(face):
-        return (np.zeros(0, np.int32),) * 3
+        nothing = np.zeros(0, np.int32)
+        return nothing, nothing, nothing
     lane = dr.arange(mi.UInt32, 3 * dr.width(face))
     half = 3 * dr.gather(mi.UInt32, face, lane // 3) + lane % 3
     start = dr.gather(mi.UInt32, triangles, half)
@@ -85,7 +88,8 @@ def _where_it_turns(facing: mi.UInt32, triangles: mi.UInt32, vertices: int) -> t
     lanes = dr.compress((dr.gather(mi.UInt32, turns, start) & dr.gather(mi.UInt32, turns, end)) != 0)
     chosen = [dr.gather(mi.UInt32, column, lanes) for column in (half, start, end)]
     dr.eval(chosen)
-    return tuple(np.array(column).view(np.int32) for column in chosen)
+    half, start, end = (np.array(column).view(np.int32) for column in chosen)
+    return half, start, end
 
 
 def _turning(facing: np.ndarray, edges: MeshEdges, views: int) -> tuple[np.ndarray, np.ndarray]:

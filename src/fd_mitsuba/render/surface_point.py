@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 
+from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.render.cameras import FilmCamera
 from fd_mitsuba.render.mesh_tracer import Hit
-
-NormalSpace = Literal["camera", "world"]
 
 
 @dataclass(frozen=True)

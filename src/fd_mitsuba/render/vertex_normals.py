@@ -55,9 +55,12 @@ class _Normals(torch.autograd.Function):
             ctx.save_for_backward(corners, to_b, to_c, normals, inverse)
         return _rows(normals)
 
+    # What `once_differentiable` makes of it takes no keywords, which torch's own signature has.
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, gradient: Tensor
+    ) -> tuple[Tensor | None, ...]:
         corners, to_b, to_c, normals, inverse = ctx.saved_tensors
         of_total = _columns(gradient)
         of_total = of_total.sub_(_dot(of_total, normals) * normals).mul_(inverse)

@@ -77,11 +77,10 @@ def opened_base(scene: EditScene, folder: Path) -> dict[int, Path | None] | None
         return None
     record = folder / "export" / "part.json"
     names = (read_json_object(record) or {}).get("opened")
-    plain = isinstance(names, dict) and all(
+    if not isinstance(names, dict) or not all(
         number.isdecimal() and (name is None or (isinstance(name, str) and Path(name).name == name))
         for number, name in names.items()
-    )
-    if not plain:
+    ):
         raise UserError(f"{record}: does not state what is left of the base; run the geometry stage anew")
     opened = {int(number): None if name is None else folder / "export" / name for number, name in names.items()}
     for path in opened.values():

@@ -9,7 +9,7 @@ import numpy as np
 
 from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import GuidanceConfig, RunConfig
-from fd_mitsuba.conventions import GRID_HALF_EXTENT
+from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -101,7 +101,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     )
     # The run leaves the appearance stage out where its prior knows no faces of a cut.
     left_out = builtin and scene.subtracts and config.appearance.lambda_sds > 0
-    stages = ("geometry",) if left_out else ("geometry", "appearance")
+    stages = ("geometry",) if left_out else STAGES
     shape_memory = sum(run_memory(size, config, ("geometry",), weights).values())
     terms = run_memory(size, config, stages, weights)
     try:

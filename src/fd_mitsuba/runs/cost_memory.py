@@ -60,7 +60,7 @@ class SceneSize:
     @classmethod
     def of(cls, scene: EditScene) -> SceneSize:
         """Read from the heads of the scene's files; an image that does not say its size counts as none."""
-        file = scene.inputs().scene
+        file = scene.inputs.scene
         lights, textures = {}, {}
         for element in file.elements:
             name = element.properties.get("filename")

@@ -31,7 +31,6 @@ from fd_mitsuba.runs.locality import measure_locality
 from fd_mitsuba.runs.own_meshes import as_mesh, base_mesh, edited_mesh, start_mesh
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_mode import cut_faces_name
-from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.training.checkpoint import checkpoint_folder, list_checkpoints, load_trained
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -148,8 +147,8 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
     write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
     identical = copy_base(scene, export / "base")
     # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
-    grown = tuple(tensor.numpy() for tensor in stage.extractor.extract_part(stage.field))
-    base = scene.base_canonical
+    vertices, faces = stage.extractor.extract_part(stage.field)
+    base, grown = scene.base_canonical, (vertices.numpy(), faces.numpy())
     locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
     # Parts may join the base through each other, so that their gaps are those of all together.
     whole = next(iter(parts.values())) if len(parts) == 1 else part_solid(stage.grown(), None)
@@ -174,7 +173,7 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
 
 def cut_out(scene: EditScene, solids: dict[str, Solid]) -> CutBase:
     """What the parts of a scene that subtracts take away, and what they leave of the base."""
-    return cut_base(scene, SceneFile(scene.path, scene.parameters), solids)
+    return cut_base(scene, scene.inputs.scene, solids)
 
 
 def removed_parts(scene: EditScene, cut: CutBase) -> dict[str, Solid]:

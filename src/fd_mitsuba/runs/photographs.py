@@ -88,7 +88,7 @@ class PhotoViews:
     def of(cls, scene: EditScene, folder: Path) -> PhotoViews:
         """Those of a run folder whose Mitsuba scene has been exported."""
         away, frame, base = ("focal_region", "sensor", "integrator"), scene.render_frame, scene.base_canonical.vertices
-        exported, original = SceneFile(folder / "export" / "mitsuba" / "scene.xml"), scene.inputs().scene
+        exported, original = SceneFile(folder / "export" / "mitsuba" / "scene.xml"), scene.inputs.scene
         loaded = exported.instantiate(without=away, origin=scene.origin)
         old = {part.shape for part in scene.earlier}
         grown = [shape for shape in loaded.shapes() if shape.id().startswith(_GROWN) and shape.id() not in old]

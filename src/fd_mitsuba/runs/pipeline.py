@@ -14,6 +14,7 @@ from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
+from fd_mitsuba.conventions import STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, chosen_exporters, export_assets
 from fd_mitsuba.export.final_surface.final_part import FinalPart, final_parts
@@ -56,7 +57,6 @@ from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import OnStep
 
-STAGES = ("geometry", "appearance")
 _VOLUME_CHANGE_SAID = 0.05
 
 

@@ -21,7 +21,7 @@ def resumed_scene(folder: Path, scene: str, regions: str | None, say: Callable[[
     for key, given in (("scene", scene), ("regions", regions)):
         recorded, copy = known.get(key), copies.get(key)
         gone = given is not None and not Path(given).exists()
-        if gone and isinstance(recorded, str) and isinstance(copy, str) and (folder / copy).is_file():
+        if given and gone and isinstance(recorded, str) and isinstance(copy, str) and (folder / copy).is_file():
             if (folder.resolve() / recorded).resolve() == Path(given).resolve():
                 say(f"{given}: the run's scene is gone; taking the copy of it in {(folder / copy).parent}")
                 given = str(folder / copy)

@@ -48,7 +48,7 @@ def check_appearance_inputs(scene: EditScene) -> tuple[str, ...]:
             metallic or alpha outside [0, 1], as a number, in a picture or in an attribute of the mesh.
     """
     warnings: list[str] = []
-    inputs = scene.inputs()
+    inputs = scene.inputs
     file, (_, part) = inputs.scene, inputs.part_bsdf()
     if not scene.has_light:
         raise UserError(f'{scene.path}: no emitter; a material is learned under light, add <emitter type="constant"/>')
@@ -77,7 +77,7 @@ def check_shading(scene: EditScene, loaded: Any, shapes: list[Any]) -> list[str]
     Raises:
         UserError: a BSDF that Mitsuba loads but cannot render.
     """
-    file = scene.inputs().scene
+    file = scene.inputs.scene
     try:
         return shading_warnings(file.mi, loaded, shapes, scene.render_base)
     except RuntimeError as error:

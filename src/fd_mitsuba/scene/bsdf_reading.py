@@ -75,7 +75,7 @@ def read_material(mi: Any, bsdf: Any, interaction: Any, count: int) -> Reading:
     """
     children = child_objects(mi, bsdf)
     nested = [child for child in children.values() if isinstance(child, mi.BSDF)]
-    weight = children.get("weight")
+    weight: Any = children.get("weight")
     if len(nested) == 2 and isinstance(weight, mi.Texture):
         share = np.clip(_scalar(weight.eval_1(interaction), count), 0, 1)
         first, second = (read_material(mi, child, interaction, count) for child in nested)
@@ -94,13 +94,13 @@ def _read_leaf(mi: Any, bsdf: Any, children: dict[str, Any], interaction: Any, c
         return isinstance(children.get(name), mi.Texture) or bool(np.all(np.array(bsdf.has_attribute(name))))
 
     def scalar(name: str) -> np.ndarray:
-        texture = children.get(name)
+        texture: Any = children.get(name)
         is_texture = isinstance(texture, mi.Texture)
         value = texture.eval_1(interaction) if is_texture else bsdf.eval_attribute_1(name, interaction)
         return _scalar(value, count)
 
     def colour(name: str) -> np.ndarray:
-        texture = children.get(name)
+        texture: Any = children.get(name)
         is_texture = isinstance(texture, mi.Texture)
         value = texture.eval(interaction) if is_texture else bsdf.eval_attribute_3(name, interaction)
         return _colour(value, count)

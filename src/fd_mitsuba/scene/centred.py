@@ -42,8 +42,10 @@ def restore_digits(file: SceneFile, scene: Any, pairs: list[tuple[SceneElement, 
     for element, shape in pairs:
         filename = element.properties.get("filename")
         key = key_of.get(id(shape))
-        exact = read_positions(file.resolve(filename)) if isinstance(filename, str) and key else None
-        if exact is None or key is None:
+        if not isinstance(filename, str) or key is None:
+            continue
+        exact = read_positions(file.resolve(filename))
+        if exact is None:
             continue
         placed = element.properties.get("to_world")
         matrix = np.eye(4) if placed is None else np.array(placed.matrix, dtype=np.float64)

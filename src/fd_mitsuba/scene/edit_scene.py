@@ -41,10 +41,11 @@ FOREIGN_MESHES = frozenset(".stl .glb .gltf .fbx .dae .off .3ds .blend .usd .usd
 
 @dataclass(frozen=True)
 class EditScene:
-    """A scene to edit; frozen, with nothing of Mitsuba in it.
+    """A scene to edit; frozen, with nothing of Mitsuba's instantiated in it.
 
     Attributes:
         path: the scene file.
+        inputs: the parsed files, for all that asks more of them: a file is read and checked once.
         parameters: the `-D` values that the scene file was read with.
         prompt: what the edited object shall look like; never blank.
         base_prompt: what the base looks like, "" if not given.
@@ -62,6 +63,7 @@ class EditScene:
     """
 
     path: Path
+    inputs: EditInputs = field(repr=False, compare=False)
     prompt: str
     base: tuple[TriangleMesh, ...]
     regions: tuple[FocalRegion, ...]
@@ -136,13 +138,9 @@ class EditScene:
         soup = self.base_soup
         return TriangleMesh(BASE_NAME, self.frame.to_canonical(soup.vertices), soup.faces, soup.source_files)
 
-    def inputs(self) -> EditInputs:
-        """The files that the scene was read from, parsed again."""
-        return EditInputs.open(self.path, self.regions_parameters | self.parameters, self.regions_path)
-
     def mitsuba_scene(self, without: tuple[str, ...] = ()) -> Any:
         """The scene file as an `mi.Scene` in the render frame; see `SceneFile.instantiate`."""
-        return SceneFile(self.path, self.parameters).instantiate(without, self.origin)
+        return self.inputs.scene.instantiate(without, self.origin)
 
 
 def load_edit_scene(
@@ -211,6 +209,7 @@ def load_edit_scene(
     record = [folder / RECORD_NAME, *(part.normal_path(folder) for part in earlier)] if earlier else []
     return EditScene(
         path=file.path,
+        inputs=inputs,
         prompt=prompts[0],
         base=base,
         regions=found,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fd_mitsuba.scene.scene_file import SceneFile
 
 
-def fault_of_file(file: SceneFile, error: RuntimeError) -> UserError | None:
+def fault_of_file(file: SceneFile, error: Exception) -> UserError | None:
     """The error as one line about a mesh or a picture that the scene names; None if it is none of theirs."""
     text = str(error)
     for element in file.elements:

@@ -58,7 +58,7 @@ def part_material(scene: EditScene, fixed: Collection[str] = (), normal_map: boo
         UserError: nothing is left to learn; several BSDFs in one; a texture that varies over the surface, since the
             part has no UVs and no vertex attributes while it is learned.
     """
-    file, element = scene.inputs().part_bsdf()
+    file, element = scene.inputs.part_bsdf()
     owner = f'{file.path}: <bsdf id="{DEFAULT_PART_NAME}">' if element is None else f"{element.where}: {element}"
     description = {"type": "principled"} if element is None else file.description(element)
     prefix = _prefix_of_innermost(file.mi, description, owner)

@@ -124,7 +124,8 @@ def _export_settings(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _entry(values: dict[str, Any]) -> StackedPart:
-    part = StackedPart(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    part = StackedPart(**given)
     if not all(isinstance(value, str) for value in (part.name, part.prompt, part.file, part.normal, *part.pictures)):
         raise ValueError("not text")
     if Path(part.shape).name != part.shape:  # it becomes part of a file's name

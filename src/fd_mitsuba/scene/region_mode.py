@@ -64,8 +64,8 @@ def check_modes(
             if not near and _reaches(region, points, mesh):
                 near = True
                 _check_solid(element, mesh)
-        depth = [region.sdf(points) for region in regions]
-        left = left or not near or bool((sum(d > 0 for d in depth) == 0).any())
+        within = np.any([region.sdf(points) > 0 for region in regions], axis=0)
+        left = left or not near or not bool(within.all())
     if not left:
         raise elements[0].error("takes all of the base away; shrink it")
 

@@ -47,7 +47,7 @@ class SceneCopy:
     @classmethod
     def of(cls, scene: EditScene) -> SceneCopy:
         """The plan for a scene; nothing is read but what says which files there are."""
-        inputs, plan = scene.inputs(), cls()
+        inputs, plan = scene.inputs, cls()
         home = scene.path.parent
         listed = dict.fromkeys(inputs.files)
         beside = [path for path in scene.files if path not in listed]  # such as the record of earlier rounds
@@ -101,7 +101,8 @@ def copied_files(scene: Path) -> dict[str, Path]:
         names = json.loads(path.read_text(encoding="utf-8")) if path.stat().st_size <= _MOST_BYTES else None
     except (OSError, ValueError, RecursionError):
         names = None
-    places = [PurePosixPath(str(place)) for place in names.values()] if isinstance(names, dict) else []
+    names = names if isinstance(names, dict) else {}
+    places = [PurePosixPath(str(place)) for place in names.values()]
     if not places or any(place.is_absolute() or ".." in place.parts for place in places):
         raise UserError(f"{path}: is damaged; put the scene's files where the scene names them, and delete this file")
     return {name: folder / place for name, place in zip(names, places, strict=True)}

@@ -52,7 +52,9 @@ class CameraBatch:
         centre = np.broadcast_to(np.zeros(3) if target is None else np.asarray(target, dtype=np.float64), (count, 3))
         az, el = np.radians(azimuth), np.radians(elevation)
         direction = np.stack([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)], axis=1)
-        wrapped = np.float32(np.mod(azimuth, 360.0)) % np.float32(360.0)  # rounding to float32 may give 360 itself
+        wrapped = np.mod(azimuth, 360.0).astype(np.float32) % np.float32(
+            360.0
+        )  # rounding to float32 may give 360 itself
         fov = np.broadcast_to(np.asarray(fov_deg, dtype=np.float64), (count,))
         return cls(centre + distance[:, None] * direction, centre, fov, wrapped, elevation)
 

@@ -208,8 +208,8 @@ class _Scan:
 
     def _included(self, element: XmlElement) -> Path:
         filename = element.attributes["filename"]
+        target = element.file.parent / filename
         try:
-            target = element.file.parent / filename
             outside = not filename or not target.resolve().is_relative_to(self.folder)
             missing = not outside and not target.exists()
         except (OSError, ValueError, RuntimeError):  # too long, a NUL, a circle of symbolic links

@@ -16,7 +16,7 @@ def base_glb(scene: EditScene) -> bytes:
     Raises:
         UserError: a file of the scene that cannot be read any more.
     """
-    inputs = scene.inputs()
+    inputs = scene.inputs
     written: dict[str, bytes] = {}
     shapes = base_shapes(scene, inputs.scene)
     content = ExportContent(scene, inputs, shapes, [], None, {}, {}, {}, {}, written.__setitem__)

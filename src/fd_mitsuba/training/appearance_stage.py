@@ -211,7 +211,7 @@ class AppearanceStage:
     @torch.no_grad()
     def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:
         """The same views with the part in plain grey clay, for models that are shown what they edit."""
-        if not self.guidance.needs_base:
+        if self.guidance is None or not self.guidance.needs_base:
             return None
         clay_part = self.rendering.render_clay(gbuffer, seed)
         return self._finished(clay_part + pictures.base_path, gbuffer, step)

@@ -13,6 +13,7 @@ import json
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -104,7 +105,7 @@ def load_newest(
         except (SafetensorError, OSError, ValueError) as error:
             remarks.append(f"{path}: damaged checkpoint passed over ({' '.join(str(error).split())})")
             continue
-        _check_header(path, header, stage, config_hash)
+        header = _checked_header(path, header, stage, config_hash)
         if header.get("sha256") != _digest(tensors):
             remarks.append(f"{path}: damaged checkpoint passed over (its tensors do not fit their hash)")
             continue
@@ -138,7 +139,7 @@ def _digest(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _check_header(path: Path, header: object, stage: str, config_hash: str) -> None:
+def _checked_header(path: Path, header: object, stage: str, config_hash: str) -> dict[str, Any]:
     if not isinstance(header, dict):
         raise UserError(f"{path}: not a checkpoint of fd_mitsuba (no header); remove it or choose another -o folder")
     if header.get("format") != FORMAT:
@@ -154,6 +155,7 @@ def _check_header(path: Path, header: object, stage: str, config_hash: str) -> N
     counters = header.get("counters", {})
     if not isinstance(counters, dict) or not all(isinstance(value, int) for value in counters.values()):
         raise UserError(f"{path}: its header's counters cannot be read; remove this file to resume from an earlier one")
+    return header
 
 
 def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: torch.optim.Optimizer) -> None:

@@ -15,6 +15,7 @@ from fd_mitsuba.config.sections import GeometryConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.extraction.surface import Samples
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.training.geometry_losses import GEOMETRY_LOSSES, FieldLoss, FieldPlace, FieldSamples, built_in_losses
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.tethers import THIN, Tethers
@@ -44,7 +45,7 @@ class FieldLosses:
         grid: TetGrid,
         sdf_base: Tensor,
         region_sdfs: Tensor,
-        active_index: Tensor,
+        active_index: GridVertices,
         subtracts: bool,
     ) -> None:
         self._geometry, self._seed, self._active = config.geometry, config.seed, active_index
@@ -78,7 +79,7 @@ class FieldLosses:
         """Those of the losses that count."""
         return {name: weight for name, (weight, _) in self._losses.items()}
 
-    def draw(self, step: int) -> Tensor | None:
+    def draw(self, step: int) -> GridVertices | None:
         """The step's vertices (S,) int64, random by (seed, step); None if no loss looks at any."""
         if not self._losses:
             return None
@@ -86,16 +87,16 @@ class FieldLosses:
         if len(self._active) <= count:
             return self._active
         generator = torch.Generator().manual_seed(seed_for(self._seed, Purpose.SAMPLES, step))
-        return self._active[torch.randint(len(self._active), (count,), generator=generator)]
+        return GridVertices(self._active[torch.randint(len(self._active), (count,), generator=generator)])
 
-    def with_tethers(self, samples: Tensor | None) -> Samples | None:
+    def with_tethers(self, samples: GridVertices | None) -> Samples | None:
         """`draw`'s samples, and after them the vertices between the object and loose pieces where their loss counts."""
         tethers = self._tethers
         if samples is None or tethers is None:
             return samples
-        return lambda deeper: torch.cat([samples, tethers.find(deeper)])
+        return lambda deeper: GridVertices(torch.cat([samples, tethers.find(deeper)]))
 
-    def __call__(self, sdf_part: Tensor, samples: Tensor, step: int = 0) -> dict[str, Tensor]:
+    def __call__(self, sdf_part: Tensor, samples: GridVertices, step: int = 0) -> dict[str, Tensor]:
         """The losses by their names, without the weights; gradients flow to `sdf_part`.
 
         Args:

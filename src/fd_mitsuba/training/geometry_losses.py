@@ -16,6 +16,7 @@ from fd_mitsuba.config import GeometryConfig, Section
 from fd_mitsuba.config.bounds import Length, Width
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import Registry
+from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.losses.collision import loss_collision
 from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.losses.presence import loss_presence
@@ -58,7 +59,7 @@ class FieldSamples:
     """
 
     sdf_part: Tensor
-    index: Tensor
+    index: GridVertices
     at_tethers: Tensor
     place: FieldPlace
     step: int

@@ -21,6 +21,7 @@ from fd_mitsuba.extraction.subtraction import SubtractionExtractor
 from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.fields.base_shape import base_sdf
+from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.fields.varied_start import varied_start
 from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
@@ -218,7 +219,7 @@ class GeometryStage:
             passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
         return passes[phase]
 
-    def _extractor(self, active: Tensor) -> SurfaceExtractor:
+    def _extractor(self, active: GridVertices) -> SurfaceExtractor:
         geometry = self.config.geometry
         kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
         return kind(
@@ -237,7 +238,7 @@ class GeometryStage:
 
     def _base_surface(self) -> UnionSurface:
         with torch.no_grad():
-            alone = self._extractor(torch.zeros(0, dtype=torch.int64))
+            alone = self._extractor(GridVertices(torch.zeros(0, dtype=torch.int64)))
             return alone(PartField(self.config.field))
 
     def _watch_visibility(self, pictures: Tensor) -> None:

@@ -29,13 +29,25 @@ class StepRecord:
 class Stage(Protocol):
     """One stage of a run. Its random numbers depend on (seed, step) only, so that it can go on from any step."""
 
-    name: str
-    steps: int
-    config: RunConfig
-    field: torch.nn.Module
-    optimiser: torch.optim.Optimizer
-    counters: dict[str, int]
-    """What is counted from step to step, such as steps in a row without a visible part; stored with checkpoints."""
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def config(self) -> RunConfig: ...
+
+    @property
+    def field(self) -> torch.nn.Module: ...
+
+    @property
+    def optimiser(self) -> torch.optim.Optimizer: ...
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What is counted from step to step, such as steps in a row without a visible part; stored with checkpoints."""
+        ...
 
     def step(self, step: int) -> StepRecord:
         """Run step `step`, counted from 0, and change the field once; RunStopped if it cannot go on."""

@@ -15,7 +15,8 @@ from fd_mitsuba.scene.views import CameraBatch, sample_views
 class SeesMosaics(Protocol):
     """A guidance, as far as the choice of views is concerned."""
 
-    view_grid: int
+    @property
+    def view_grid(self) -> int: ...
 
 
 def views_at_once(guidance: SeesMosaics | None) -> int:

@@ -6,6 +6,8 @@ carry floats. This looks at one state of the part alone: a run that is resumed g
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -14,6 +16,7 @@ from torch import Tensor
 from fd_mitsuba.extraction.lattice_box import LatticeBox
 from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.fields.index_spaces import GridVertices
 
 LEAST_SHARE = 0.02
 """Pieces with less than this share of the part's vertices are left alone; the export drops the smallest."""
@@ -31,7 +34,7 @@ class Tethers:
         active_index: (A,) int64 vertices at which the part exists.
     """
 
-    def __init__(self, grid: TetGrid, sdf_base: Tensor, room: Tensor, active_index: Tensor) -> None:
+    def __init__(self, grid: TetGrid, sdf_base: Tensor, room: Tensor, active_index: GridVertices) -> None:
         self._box = LatticeBox(grid, active_index)
         self._place = self._box.local(active_index)
         self._base = self._box.cut(sdf_base > 0).numpy()
@@ -39,7 +42,7 @@ class Tethers:
         reachable[active_index] = room[active_index]
         self._room = self._box.cut(reachable).numpy()
 
-    def find(self, deeper: Tensor) -> Tensor:
+    def find(self, deeper: Tensor) -> GridVertices:
         """The vertices (T,) int64 of `tether_vertices`. No gradients.
 
         Args:
@@ -48,7 +51,7 @@ class Tethers:
         part = torch.zeros(len(self._box.vertices), dtype=torch.bool)
         part[self._place] = deeper
         found = tether_vertices(part.view(self._box.shape).numpy(), self._base, self._room)
-        return self._box.vertices[torch.from_numpy(found)]
+        return GridVertices(self._box.vertices[torch.from_numpy(found)])
 
 
 def tether_vertices(part: np.ndarray, base: np.ndarray, room: np.ndarray) -> np.ndarray:
@@ -68,7 +71,8 @@ def tether_vertices(part: np.ndarray, base: np.ndarray, room: np.ndarray) -> np.
     loose = np.flatnonzero(~held & (sizes >= max(1.0, LEAST_SHARE * part.sum())))
     if not len(loose) or not held.any():
         return np.zeros(0, dtype=np.int64)
-    distance, nearest = ndimage.distance_transform_edt(~held[label], return_indices=True)
+    found: Any = ndimage.distance_transform_edt(~held[label], return_indices=True)
+    distance, nearest = found
     marked = np.zeros(part.shape, dtype=bool)
     for number in loose:
         piece = np.argwhere(label == number)

@@ -14,7 +14,7 @@ from fd_mitsuba.backend import startup
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import FocalRegion
-from fd_mitsuba.scene.scene_file import SceneFile, ready_mitsuba
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 from fd_mitsuba.viewing.preview_sheet import write_sheet
 from fd_mitsuba.viewing.preview_views import VIEW_NAMES, ParallelView, preview_views
 
@@ -60,7 +60,7 @@ def region_colours(count: int) -> list[tuple[float, float, float]]:
 
 def _base_pictures(scene: EditScene, views: Sequence[ParallelView], size: int) -> tuple[np.ndarray, np.ndarray]:
     """sRGB pictures (B, 2 size, 2 size, 3) in [0, 1] on paper, and the base's distance (canonical units)."""
-    file = SceneFile(scene.path, scene.parameters)
+    file = scene.inputs.scene
     mi = file.mi
     loaded = file.instantiate(without=("focal_region", "sensor", "integrator"), origin=scene.origin)
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})

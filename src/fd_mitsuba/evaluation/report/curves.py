@@ -46,7 +46,7 @@ def stage_curves(rows: Sequence[dict]) -> list[Curve]:
             if isinstance(row.get(name), int | float) and math.isfinite(row[name]) and "step" in row
         ]
         if len(points) >= 2 and len({value for _, value, _ in points}) > 1:
-            title = _TITLES.get(name, name.replace("_", " "))
+            title = _TITLES.get(name) or name.replace("_", " ")
             found.append(Curve(title, name, curve_svg(points, title), points[-1][1]))
     return found
 

@@ -168,7 +168,7 @@ def _some(frames: np.ndarray) -> np.ndarray:
 def _means(columns: Sequence[_Column], rows: Sequence[GalleryRow]) -> list[Cell]:
     means = []
     for number, column in enumerate(columns):
-        values = [row.cells[number].value for row in rows if row.cells[number].value is not None]
+        values = [value for row in rows if (value := row.cells[number].value) is not None]
         mean = sum(values) / len(values) if values and column.title != "seed" else None
         means.append(Cell(mean, "" if mean is None else column.text(mean)))
     return means

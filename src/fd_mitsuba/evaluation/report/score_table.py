@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
@@ -37,7 +38,8 @@ class Column:
 
 
 def _at(*path: str) -> Callable[[dict], Number]:
-    def value(found: dict) -> Number:
+    def value(record: dict) -> Number:
+        found: Any = record
         for key in path:
             found = found.get(key) if isinstance(found, dict) else None
         return None if found is None else float(found)

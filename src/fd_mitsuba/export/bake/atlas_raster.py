@@ -104,7 +104,7 @@ def _at_edge(faces: np.ndarray, count: int) -> np.ndarray:
     single = keys[times == 1]
     border = np.zeros(count, dtype=bool)
     border[single // count] = border[single % count] = True
-    return border[faces].any(axis=1)
+    return np.any(border[faces], axis=1)
 
 
 def _runs(pairs: np.ndarray) -> list[tuple[int, int]]:

@@ -112,7 +112,9 @@ def bake(
     fill_holes(list(pictures.values()), known)
     for name in ("normal", "normal_mitsuba"):
         length = np.linalg.norm(pictures[name], axis=-1, keepdims=True)
-        pictures[name] = np.where(length > 1e-6, pictures[name] / np.maximum(length, 1e-6), np.float32([0, 0, 1]))
+        pictures[name] = np.where(
+            length > 1e-6, pictures[name] / np.maximum(length, 1e-6), np.array([0, 0, 1], np.float32)
+        )
     return TextureSet(**pictures, covered=covered)
 
 
@@ -120,7 +122,8 @@ def fill_holes(pictures: list[np.ndarray], known: np.ndarray) -> None:
     """Give every texel that is not `known` (H, W) the value of the nearest one that is, in place."""
     if known.all() or not known.any():
         return
-    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rows, columns = nearest
     holes = ~known
     rows, columns = rows[holes], columns[holes]
     for picture in pictures:

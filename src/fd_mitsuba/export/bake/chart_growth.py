@@ -7,15 +7,17 @@ than to any other along the surface, so that it stretches along flat places and 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from fd_mitsuba.export.final_surface.mesh_rings import Edges, cross_of_faces
 
 _FIRST, _MOST = 10, 22
+"""Charts at first, and at most: each chart costs a gutter, each one too few a distorted or overlapping one."""
 _WIDEST = 85.0
 """Degrees between a chart's mean normal and any of its faces: beyond it another seed is set."""
 _MOVES = 3
+"""Times that the seeds are moved to their charts' middles, as in Lloyd's algorithm, before more are set."""
 _SMALLEST = 0.004
 """Share of the surface below which a chart is joined to another, if that stays a disc."""
 
@@ -30,7 +32,7 @@ def grown_charts(vertices: np.ndarray, faces: np.ndarray, edges: Edges) -> np.nd
     places = np.concatenate([vertices[faces].mean(axis=1), weight * normal], axis=1)
     one, other = edges.faces.T
     length = np.linalg.norm(places[one] - places[other], axis=1) + 1e-12
-    graph = coo_array((length, (one, other)), shape=(len(faces),) * 2).tocsr()
+    graph = csr_array(coo_array((length, (one, other)), shape=(len(faces),) * 2))
     seeds = _spread(graph, area)
     chart, distance = _nearest(graph, seeds)
     for _ in range(_MOST):
@@ -57,7 +59,7 @@ def split_chart(vertices: np.ndarray, faces: np.ndarray, edges: Edges, chart: np
     place[own] = np.arange(len(own))
     one, other = place[edges.faces[inside]].T
     length = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-12
-    graph = coo_array((length, (one, other)), shape=(len(own),) * 2).tocsr()
+    graph = csr_array(coo_array((length, (one, other)), shape=(len(own),) * 2))
     halves, _ = _nearest(graph, np.array([np.argmin(along), np.argmax(along)]))
     chart = chart.copy()
     chart[own[halves == 1]] = chart.max() + 1
@@ -71,7 +73,7 @@ def euler_numbers(faces: np.ndarray, edges: Edges, chart: np.ndarray, count: int
     return sum(sign * np.bincount(x, minlength=count) for sign, x in ((1, corners), (-1, sides), (1, chart)))  # type: ignore[return-value]
 
 
-def _spread(graph: coo_array, area: np.ndarray) -> np.ndarray:
+def _spread(graph: csr_array, area: np.ndarray) -> np.ndarray:
     """Seeds far from each other, one a piece of the surface at least."""
     seeds = [int(np.argmax(area))]
     distance = dijkstra(graph, directed=False, indices=seeds[0])
@@ -81,10 +83,10 @@ def _spread(graph: coo_array, area: np.ndarray) -> np.ndarray:
     return np.array(seeds)
 
 
-def _nearest(graph: coo_array, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(graph: csr_array, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The place in `seeds` of the nearest one, (F,), and how far it is."""
     distance, _, source = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)
-    number = np.full(graph.shape[0], 0)
+    number = np.full(len(distance), 0)
     number[seeds] = np.arange(len(seeds))
     return number[source], distance
 
@@ -144,7 +146,7 @@ def _smoothed(edges: Edges, faces: np.ndarray, chart: np.ndarray) -> np.ndarray:
     sides = edges.faces[edges.face_edges]
     beside = np.where(sides[..., 0] == np.arange(len(faces))[:, None], sides[..., 1], sides[..., 0])
     before = euler_numbers(faces, edges, chart, count)
-    for turn in range(6):
+    for turn in range(6):  # half of the faces at a time: neighbours that moved together would only swap their teeth
         near = chart[beside]
         a, b, c = near.T
         pair = np.where(a == b, a, np.where(b == c, b, c))

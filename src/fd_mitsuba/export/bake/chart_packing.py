@@ -7,6 +7,7 @@ correlation by Fourier transform says that of all places at once; of these the f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -71,7 +72,8 @@ def _shapes(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray, count: int
         empty = np.ones((height, width), dtype=bool)
         empty[index[:, 1], index[:, 0]] = False
         # A cell's middle is up to 0.71 cells from a point in it; half a cell each is made up for by the other chart's.
-        shapes.append(_Shape(distance_transform_edt(empty) <= gutter + 0.75, low))
+        away: Any = distance_transform_edt(empty)
+        shapes.append(_Shape(away <= gutter + 0.75, low))
     return shapes
 
 
@@ -95,13 +97,15 @@ def _laid(shapes: list[_Shape], order: np.ndarray, cells: int) -> list[tuple[int
     taken = np.zeros((cells, cells), dtype=np.float32)
     places: list[tuple[int, np.ndarray]] = [(0, np.zeros(2))] * len(shapes)
     for number in order:
-        spectrum, best = fft.rfft2(taken), None
+        spectrum: Any = fft.rfft2(taken)
+        best = None
         for quarter in range(4):
             mask = _turned_mask(shapes[number].mask, quarter)
             height, width = mask.shape
             if height > cells or width > cells:
                 continue
-            overlap = fft.irfft2(spectrum * np.conj(fft.rfft2(mask.astype(np.float32), taken.shape)), taken.shape)
+            other: Any = fft.rfft2(mask.astype(np.float32), taken.shape)
+            overlap: Any = fft.irfft2(spectrum * np.conj(other), taken.shape)
             free = overlap[: cells - height + 1, : cells - width + 1] < 0.5
             if not free.any():
                 continue

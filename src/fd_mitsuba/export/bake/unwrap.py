@@ -1,4 +1,14 @@
-"""A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart."""
+"""A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart.
+
+    charts    `grown_charts` (few, wide) or xatlas (any mesh)     which faces lie together, and where the seams are
+    flat      `flattened`, or xatlas                              each chart laid flat, in the mesh's own unit
+    notches   `open_notches`, `crowded`                           places where a texel would belong to two of its faces
+    packed    `packed_charts` (few), or xatlas                    all charts in the unit square, with gutters
+    left out  `place_left_out`                                    faces without an area, which xatlas packs nowhere
+
+What travels through these steps is a triple: `vertex_map` (S,) says which vertex each split vertex was, `split` (F, 3)
+are the faces in split vertices, and `flat` or `uv` (S, 2) where those lie. A vertex on a seam is there once a chart.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +34,7 @@ _ROUNDS, _TRIES = 3, 40
 _FEW_CHARTS = 100
 """So many charts are laid one by one; more would take too long."""
 _PACKINGS = 6
+"""Densities that are tried until xatlas's packing is as large as the texture; it takes a wish, not a size."""
 _LONGEST = 1000.0
 """The size that xatlas sees: it takes triangles below 1e-7 in area for nothing, which slivers of a unit mesh are."""
 
@@ -95,7 +106,7 @@ def _wide_charts(
         return None
     chart = grown_charts(vertices, faces, edges)
     laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # its faces, their vertices, places
-    tries = 0
+    tries, found = 0, None
     for _ in range(_ROUNDS):
         waiting = [number for number in np.unique(chart).tolist() if number not in laid]
         while waiting:
@@ -112,14 +123,14 @@ def _wide_charts(
             fresh = int(chart.max()) + 1
             chart = split_chart(vertices, faces, edges, chart, number)
             waiting += [number, fresh]
-        vertex_map, split, flat = _side_by_side(faces, laid)
+        vertex_map, split, flat = found = _side_by_side(faces, laid)
         narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
         for number in np.unique(chart[narrow]).tolist():
             chart = split_chart(vertices, faces, edges, chart, number)
             del laid[number]
         if not len(narrow):
             break
-    return vertex_map, split, flat
+    return found
 
 
 def _side_by_side(
@@ -230,9 +241,10 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         if laid is not None:
             return laid
     density = _likely_density(flat, faces, texture_size)
-    best, best_density, upper = None, 0.0, np.inf
+    best, last, best_density, upper = None, flat, 0.0, np.inf
     for _ in range(_PACKINGS):
         uv, size = _pack(flat, faces, density, padding_for(texture_size))
+        last = uv / max(size, 1)
         if size <= texture_size:
             best, best_density = uv / texture_size, density
             if size > 0.97 * texture_size:
@@ -243,7 +255,7 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         inside = best_density < wanted < upper
         density = wanted if inside else (best_density + upper) / 2 if np.isfinite(upper) and best_density else wanted
     # Many tiny charts: the gutters alone fill the texture. Rather a thinner gutter than none of the faces.
-    return best if best is not None else uv / max(size, 1)
+    return best if best is not None else last
 
 
 def _likely_density(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> float:

@@ -85,7 +85,8 @@ def refined(
     active = ndimage.binary_dilation(near.numpy(), np.ones((3, 3, 3)))
     bounds = [slice(max(s.start - 2, 0), s.stop + 2) for s in ndimage.find_objects(active.astype(np.int8))[0]]
     active = active[tuple(bounds)].copy()
-    vertices = tuple(slice(b.start, b.start + side + 1) for b, side in zip(bounds, active.shape, strict=True))
+    z, y, x = (slice(b.start, b.start + side + 1) for b, side in zip(bounds, active.shape, strict=True))
+    vertices = (z, y, x)
     values = _upsampled(coarse[vertices].astype(np.float32), factor)
     first = np.array([vertices[axis].start for axis in (2, 1, 0)])
     made = FineLattice(values, grid.axis.numpy()[first], grid.spacing / factor, vertices, factor)
@@ -110,7 +111,8 @@ def _cells_to_add(inside: np.ndarray, known: np.ndarray, factor: int) -> np.ndar
     signs = torch.from_numpy(inside)
     open_ends = touched_cells(signs) & touched_cells(~signs) & touched_cells(torch.from_numpy(~known))
     shape = tuple(side // factor for side in open_ends.shape)
-    return open_ends.numpy().reshape(shape[0], factor, shape[1], factor, shape[2], factor).any(axis=(1, 3, 5))
+    blocks = open_ends.numpy().reshape(shape[0], factor, shape[1], factor, shape[2], factor)
+    return np.any(blocks, axis=(1, 3, 5))
 
 
 def _vertices_of(cells: np.ndarray, factor: int) -> np.ndarray:

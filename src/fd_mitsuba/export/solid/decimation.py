@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import fast_simplification
 import manifold3d
@@ -41,9 +42,10 @@ def decimated(solid: Solid, faces: int) -> Solid:
 def _attempts(solid: Solid, faces: int) -> Iterator[Solid]:
     """Solids of about `faces` faces, no further ones once one is good."""
     for aggressiveness in _AGGRESSIVENESS:
-        points, triangles = fast_simplification.simplify(
+        simpler: Any = fast_simplification.simplify(  # a pair, unless it is asked for the steps that led there
             solid.vertices, solid.faces.astype(np.int32), target_count=faces, agg=aggressiveness
         )
+        points, triangles = simpler
         made = replace(solid, vertices=points, faces=triangles)
         if not made.manifold:
             made = _parted(made)

@@ -1,12 +1,22 @@
 """The pieces that a part falls into on the tetrahedral grid: bridged, left out, filled before a surface is made.
 
-Vertices are connected along the grid's edges, so pieces here are exactly those of the extracted surface.
+Vertices are connected along the grid's edges, so pieces here are exactly those of the extracted surface. Two numbers
+stand at each vertex of the grid, and one is not the other:
+
+    pieces, `Labels`              named parts, `Owners`         `_part_shares`: (parts, 1 + pieces)
+    what is connected, from 1     what the scene calls it,              -    1    2    3
+    on; 0 where nothing is        from 0 on, everywhere           0     .   .99   0   .01   <- 3 is a stray island,
+                                                                  1     .    0    1    0       2 is all of part 1
+      . . 3 . . . . . .             0 0 0 0 0 1 1 1 1
+      . . . . . . . . .             0 0 0 0 0 1 1 1 1           Arrays over the grid are (z, y, x); tensors (count,)
+      . 1 1 1 . 2 2 . .             0 0 0 0 0 1 1 1 1           hold the same values in the same order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NewType
 
 import numpy as np
 import torch
@@ -15,6 +25,11 @@ from torch import Tensor
 
 from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.extraction.tet_grid import TetGrid
+
+Labels = NewType("Labels", np.ndarray)
+"""(z, y, x) the number of each vertex's piece, from 1 on; 0 outside of all."""
+Owners = NewType("Owners", np.ndarray)
+"""(z, y, x) the number of the named part that each vertex belongs to, from 0 on."""
 
 ISLAND_SHARE = 0.01
 """A piece with less than this share of its named part's volume is a stray island."""
@@ -53,8 +68,8 @@ def keep_large(inside: np.ndarray, volume: np.ndarray, owner: np.ndarray) -> tup
         volume: (z, y, x) how much of the part is around a vertex.
         owner: (z, y, x) number of the named part that a vertex belongs to.
     """
-    label, count = label_pieces(inside)
-    shares = _part_shares(label, count, volume, owner)
+    label, count = _labels(inside)
+    shares = _part_shares(label, count, volume, Owners(owner))
     stray = shares.max(axis=0) < ISLAND_SHARE
     stray[0] = True
     removed = [int(((shares.argmax(axis=0) == i) & stray & (shares[i] > 0))[1:].sum()) for i in range(len(shares))]
@@ -63,7 +78,7 @@ def keep_large(inside: np.ndarray, volume: np.ndarray, owner: np.ndarray) -> tup
 
 def fill_pockets(inside: np.ndarray, fillable: np.ndarray) -> np.ndarray:
     """`inside` (z, y, x) with every enclosed void filled that is `fillable` throughout."""
-    label, count = label_pieces(~inside)
+    label, count = _labels(~inside)
     border = np.ones(label.shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     keep = np.zeros(count + 1, dtype=bool)
@@ -87,13 +102,13 @@ def bridge_gaps(
         inside_of: the solid (count,) bool that belongs to a `sdf_part`.
     """
     inside = inside_of(sdf_part)
-    label, count = _label(grid, inside)
-    owners = owner.view(label.shape).numpy()
+    label, count = _labels(_lattice(grid, inside))
+    owners = Owners(_lattice(grid, owner))
     large = _part_shares(label, count, part_volume(grid, sdf_part), owners).max(axis=0) >= ISLAND_SHARE
     floating = [piece for piece in range(1, count + 1) if large[piece] and not _joined(label == piece, sdf_base)]
     if not floating:
         return sdf_part, []
-    nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     nearest_piece = label[tuple(nearest)]
     bridged, half_cell = sdf_part, grid.spacing / 2
     bridges: list[Bridge] = []
@@ -127,7 +142,7 @@ def _swollen(sdf_part: Tensor, true: Tensor, sdf_base: Tensor, bridge: Bridge) -
 
 
 def _reaches(grid: TetGrid, inside: Tensor, seed: int, sdf_base: Tensor) -> bool:
-    label, _ = _label(grid, inside)
+    label, _ = _labels(_lattice(grid, inside))
     return _joined(label == label.reshape(-1)[seed], sdf_base)
 
 
@@ -135,12 +150,17 @@ def _joined(piece: np.ndarray, sdf_base: Tensor) -> bool:
     return bool((sdf_base.numpy()[piece.reshape(-1)] > 0).any())
 
 
-def _label(grid: TetGrid, marked: Tensor) -> tuple[np.ndarray, int]:
-    """As `label_pieces`, of marks (count,)."""
-    return label_pieces(marked.view((grid.side,) * 3).numpy())
+def _labels(marked: np.ndarray) -> tuple[Labels, int]:
+    label, count = label_pieces(marked)
+    return Labels(label), count
 
 
-def _part_shares(label: np.ndarray, count: int, volume: np.ndarray, owner: np.ndarray) -> np.ndarray:
+def _lattice(grid: TetGrid, values: Tensor) -> np.ndarray:
+    """Values (count,) as (z, y, x)."""
+    return values.view((grid.side,) * 3).numpy()
+
+
+def _part_shares(label: Labels, count: int, volume: np.ndarray, owner: Owners) -> np.ndarray:
     """Which share of a named part's volume lies in a piece, (parts, 1 + count); the first column is not used."""
     shares = np.zeros((int(owner.max()) + 1, count + 1))
     for number, row in enumerate(shares):
@@ -153,4 +173,4 @@ def _part_shares(label: np.ndarray, count: int, volume: np.ndarray, owner: np.nd
 def part_volume(grid: TetGrid, sdf_part: Tensor) -> np.ndarray:
     """How much of a cell around each vertex (z, y, x) the part fills, at about."""
     volume = (0.5 + sdf_part / grid.spacing).clamp(0, 1) * (sdf_part > 0)
-    return volume.view((grid.side,) * 3).numpy()
+    return _lattice(grid, volume)

@@ -1,4 +1,4 @@
-"""The part as a solid of its own: what the union shows of it, fillet included, sunk a little into the base.
+r"""The part as a solid of its own: what the union shows of it, fillet included, sunk a little into the base.
 
 The solid is where all of these are positive, each of them a value per vertex of the grid:
 
@@ -10,6 +10,15 @@ With `fillet`, what `soft_union` adds to the larger of its two, `joined` is base
 base counts as lower from where the fillet no more raises it visibly (`away` is the distance to the part): there the
 solid's surface dives under the base's, to end in a rim instead of a film. `sunk` cuts out the base below `sink`.
 Where the solid's surface is visible it is that of the union, vertex for vertex but for the last cell before the rim.
+
+Across the place where a part stands on the base:
+
+                  |          |
+                  |   part   |
+                 /            \                <- fillet
+    ~~~~~~~~~,__/              \__,~~~~~~~~~   <- the base's surface; what is above it is seen, from rim to rim
+              \ . . . . . . . . /              <- at the rim the fillet would be a film: there the solid dives
+               \_______________/               <- `sink` below the base's surface
 
 A part that is cut out is plainly where `sdf_part` is positive, inside the base and out of it. The fillet along the
 edge of its cut is left out: it ends on the base in a film that the grid makes ragged, and nothing would hide it.
@@ -187,7 +196,7 @@ def _surface(grid: TetGrid, positions: Tensor, inside: Tensor, fields: list[Tens
     A vertex lies where the first of the fields becomes 0 along its edge: marching their minimum instead would pull
     the visible surface inward wherever another field is the smaller one at the inner end.
     """
-    shape = (grid.side,) * 3
+    shape = (grid.side, grid.side, grid.side)
     edges, faces = crossing_faces(inside.view(shape))
     lower, upper = edge_ends(edges, shape)
     inner = torch.where(inside[lower], lower, upper)

@@ -92,7 +92,7 @@ def bird(rng: np.random.Generator) -> Body:
     beak = jitter(rng, 0.3, 0.3)
     solids = [
         ellipsoid((0, body, 0), (body * 0.8, body * 0.75, body * 1.2), rotation(-12)),
-        tube([(0, body * 1.2, body * 0.6), head_at], [body * 0.45, head * 0.7]),
+        tube([np.array([0, body * 1.2, body * 0.6]), head_at], [body * 0.45, head * 0.7]),
         ellipsoid(head_at, (head,) * 3),
         tube(
             [head_at + (0, -0.03, head * 0.8), head_at + (0, -0.06, head * 0.9 + beak)],
@@ -127,7 +127,7 @@ def turtle(rng: np.random.Generator) -> Body:
     solids = [
         ellipsoid((0, 0.38, 0), (shell * 0.85, dome, shell)),
         ellipsoid((0, 0.28, 0), (shell * 0.9, 0.12, shell * 1.04)),
-        tube([(0, 0.3, shell * 0.8), head_at], [head * 0.6, head * 0.7]),
+        tube([np.array([0, 0.3, shell * 0.8]), head_at], [head * 0.6, head * 0.7]),
         ellipsoid(head_at, (head, head * 0.9, head * 1.2)),
     ]
     for z in (-0.6, 0.65):

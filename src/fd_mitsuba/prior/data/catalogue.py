@@ -86,9 +86,10 @@ class Catalogue:
 
 OFTEN = ("horse", "cat", "dog", "snowman", "mug", "bear", "deer", "person", "rabbit", "cow", "vase")
 """Bodies that most of the coarse prior's pictures show; the others keep the copying of the base general."""
-PART_SHARES = dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0) | dict.fromkeys(
-    ("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0
-)
+PART_SHARES: dict[str, float] = {
+    **dict.fromkeys(("horn", "horns", "flower", "backpack", "spikes"), 3.0),
+    **dict.fromkeys(("handle", "glasses", "antlers", "crown", "top hat", "skateboard", "tail"), 2.0),
+}
 """How much more often than the others the coarse prior is shown parts of few pixels, and those that come out worst."""
 COARSE = Catalogue(
     body_weights={name: 4.0 if name in OFTEN else 1.0 for name in BODIES},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fd_mitsuba.prior.data.body import Body, head_size, jitter
-from fd_mitsuba.prior.data.primitives import Solid, box, ellipsoid, join, mirror_x, rotation, sweep, tube
+from fd_mitsuba.prior.data.primitives import Array, Solid, box, ellipsoid, join, mirror_x, rotation, sweep, tube
 
 Rng = np.random.Generator
 
@@ -21,6 +21,18 @@ def handle(body: Body, rng: Rng) -> Solid:
     return tube(loop, np.full(11, radius))
 
 
+def board(centre: Array, path: Array, width: Array, thick: float, segments: int, exponent: float) -> Solid:
+    """A flat bar about `centre` along a path (n, 2) of y and z, as wide as (n,) half-widths to either side."""
+    zero = np.zeros(len(path))
+    return sweep(
+        centre + np.column_stack([zero, path]),
+        np.stack([width, zero, zero], 1),
+        np.stack([zero, zero + thick, zero], 1),
+        segments,
+        exponent,
+    )
+
+
 def skateboard(body: Body, rng: Rng) -> Solid:
     """A board with raised ends on four wheels, under the feet."""
     half_x, half_z = max(body.foot_x * 1.1, 0.22), max(body.foot_z * jitter(rng, 1.3), 0.55)
@@ -28,15 +40,8 @@ def skateboard(body: Body, rng: Rng) -> Solid:
     z = np.linspace(-1, 1, 11) * half_z
     rise = 0.16 * np.clip(np.abs(z) / half_z - 0.72, 0, None) / 0.28
     width = half_x * np.sqrt(np.clip(1.04 - (np.abs(z) / half_z) ** 6, 0.02, None))
-    zero = np.zeros_like(z)
     centre = np.array([0, body.bottom - thick * 0.6, body.foot_centre_z])
-    deck = sweep(
-        centre + np.stack([zero, rise, z], 1),
-        np.stack([width, zero, zero], 1),
-        np.stack([zero, zero + thick, zero], 1),
-        14,
-        exponent=0.6,
-    )
+    deck = board(centre, np.stack([rise, z], 1), width, thick, 14, 0.6)
     wheels = [
         ellipsoid(
             centre + (sx * half_x * 0.75, -thick - wheel * 0.75, sz * half_z * 0.6), (0.06, wheel, wheel), exponent=0.6

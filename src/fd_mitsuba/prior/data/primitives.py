@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Array = np.ndarray
 
@@ -44,7 +45,7 @@ def rotation(degrees_x: float = 0.0, degrees_y: float = 0.0, degrees_z: float = 
     return about_z @ about_y @ about_x
 
 
-def transform(solid: Solid, linear: Array | None = None, shift: Array | tuple = (0.0, 0.0, 0.0)) -> Solid:
+def transform(solid: Solid, linear: Array | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)) -> Solid:
     """The solid under x -> linear x + shift; the determinant must be positive."""
     vertices = solid.vertices if linear is None else solid.vertices @ np.asarray(linear, float).T
     return Solid(vertices + np.asarray(shift, float), solid.faces)
@@ -81,7 +82,7 @@ def sweep(centres: Array, across: Array, along: Array, segments: int = 14, expon
     return Solid(vertices, np.concatenate([side, caps]))
 
 
-def tube(points: Array, radii: Array, segments: int = 12, flatten: float = 1.0) -> Solid:
+def tube(points: ArrayLike, radii: ArrayLike, segments: int = 12, flatten: float = 1.0) -> Solid:
     """A round tube through points (n, 3) with radii (n,), rounded at both ends; `flatten` scales it across the path."""
     points, radii = np.asarray(points, float), np.asarray(radii, float)
     tangents = np.gradient(points, axis=0)
@@ -100,9 +101,7 @@ def tube(points: Array, radii: Array, segments: int = 12, flatten: float = 1.0) 
     return sweep(centres, across * radii[:, None], along * radii[:, None] * flatten, segments)
 
 
-def ellipsoid(
-    centre: Array | tuple, half_axes: Array | tuple, turn: Array | None = None, exponent: float = 1.0
-) -> Solid:
+def ellipsoid(centre: ArrayLike, half_axes: ArrayLike, turn: Array | None = None, exponent: float = 1.0) -> Solid:
     """An ellipsoid, or with `exponent` below 1 a rounded box, about its centre with half-axes (3,)."""
     latitudes = np.linspace(-np.pi / 2, np.pi / 2, 13)[1:-1]
     height = np.sign(np.sin(latitudes)) * np.abs(np.sin(latitudes)) ** exponent
@@ -120,12 +119,12 @@ def ellipsoid(
     return transform(unit, linear if turn is None else turn @ linear, centre)
 
 
-def box(centre: Array | tuple, half_axes: Array | tuple, turn: Array | None = None) -> Solid:
+def box(centre: ArrayLike, half_axes: ArrayLike, turn: Array | None = None) -> Solid:
     """A box with slightly rounded edges."""
     return ellipsoid(centre, half_axes, turn, exponent=0.25)
 
 
-def lathe(profile: Array | list, centre: Array | tuple = (0.0, 0.0, 0.0), segments: int = 24) -> Solid:
+def lathe(profile: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), segments: int = 24) -> Solid:
     """A solid of revolution about y through `centre`; profile rows are (radius, y) from the bottom to the top."""
     radius, height = np.asarray(profile, float).T
     zero = np.zeros_like(radius)

@@ -64,11 +64,10 @@ def evaluate_paint(
     }
     path = output.with_suffix(".json")
     done: list[tuple[Case, Painted]] = []
-    if painted:
-        guidance = DiffusionGuidance.load(
-            GuidanceConfig(model=str(folder), normalise_gradient=True), appearance=PAINT_SETTINGS
-        )
+    settings = GuidanceConfig(model=str(folder), normalise_gradient=True)
+    guidance = DiffusionGuidance.load(settings, appearance=PAINT_SETTINGS) if painted else None
     for case in cases[:painted]:
+        assert guidance is not None
         result = paint(guidance, case[0], case[1], prompt(*case), _PAINT_SEED + seed, paint_steps)
         done.append((case, result))
         say(f"{prompt(*case)}: nearest to {result.nearest}, metallic {result.metallic:.2f}")

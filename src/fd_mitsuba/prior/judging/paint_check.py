@@ -70,10 +70,10 @@ class Easel:
         self._exposure = 1.0
         # As the appearance stage: by the light alone, the base in clay.
         hits = visible(*self._sight(self.camera))
-        body, zone = hits.piece < 0, np.zeros(int((hits.piece < 0).sum()), np.int64)
+        on_body, zone = hits.piece < 0, np.zeros(int((hits.piece < 0).sum()), np.int64)
         clay = np.full((len(zone), 3), CLAY.grey, np.float32)
         rough, metal = (np.array([v], np.float32) for v in (CLAY.roughness, CLAY.metallic))
-        light = reflected(self._light, hits.normal[body], hits.to_viewer[body], zone, clay, rough, metal)
+        light = reflected(self._light, hits.normal[on_body], hits.to_viewer[on_body], zone, clay, rough, metal)
         self._exposure = CLAY_LEVEL / float(np.quantile(light @ LUMINANCE, 0.95))
 
     def _sight(self, camera: MosaicCamera) -> tuple:
@@ -90,7 +90,9 @@ class Easel:
             self._light, hits.normal[~on_part], hits.to_viewer[~on_part], zone[~on_part], colour, rough, metal
         )
         terms = [
-            lobes(self._light, hits.normal[on_part], hits.to_viewer[on_part], zone[on_part], np.float32([rough]))
+            lobes(
+                self._light, hits.normal[on_part], hits.to_viewer[on_part], zone[on_part], np.array([rough], np.float32)
+            )
             for rough in (self.roughness, CLAY.roughness)
         ]
         return EaselView(

@@ -22,7 +22,7 @@ from fd_mitsuba.prior.data.looks import NAMED, Material, random_body_look
 from fd_mitsuba.prior.data.primitives import Solid, rotation, transform
 from fd_mitsuba.prior.data.starts import starts_like
 from fd_mitsuba.prior.pictures.colour_corpus import pieces_of
-from fd_mitsuba.prior.pictures.colour_picture import LUMINANCE, Hits, paint_hits, visible
+from fd_mitsuba.prior.pictures.colour_picture import LUMINANCE, Hits, paint_hits, sum_of, visible
 from fd_mitsuba.prior.pictures.corpus import RayCaster
 from fd_mitsuba.prior.pictures.light import Light, lit_by, random_environment, reflected
 from fd_mitsuba.render.tonemap import to_srgb
@@ -163,7 +163,7 @@ def _aim(rng: np.random.Generator) -> np.ndarray:
 def _draw_start(
     scene: _Scene,
     part: Solid,
-    base_hits: tuple[np.ndarray, np.ndarray, np.ndarray],
+    base_hits: tuple[np.ndarray, np.ndarray],
     view: View,
     stretch: np.ndarray,
     rng: np.random.Generator,
@@ -229,8 +229,8 @@ def _film(pixel: np.ndarray, values: np.ndarray) -> np.ndarray:
     canvas = np.zeros((side * side, channels), np.float32)
     canvas[pixel] = values
     canvas = canvas.reshape(SIZE, SUPERSAMPLING, side, channels)
-    rows = sum(canvas[:, k] for k in range(SUPERSAMPLING)).reshape(SIZE, SIZE, SUPERSAMPLING, channels)
-    return sum(rows[:, :, k] for k in range(SUPERSAMPLING)) / np.float32(SUPERSAMPLING**2)
+    rows = sum_of(canvas[:, k] for k in range(SUPERSAMPLING)).reshape(SIZE, SIZE, SUPERSAMPLING, channels)
+    return sum_of(rows[:, :, k] for k in range(SUPERSAMPLING)) / np.float32(SUPERSAMPLING**2)
 
 
 def _patches(share: np.ndarray) -> np.ndarray:

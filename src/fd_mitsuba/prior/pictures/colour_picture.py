@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import reduce
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -10,7 +13,7 @@ import torch
 from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.prior.data.looks import CLAY, Material, Pattern
 from fd_mitsuba.prior.data.primitives import Solid
-from fd_mitsuba.prior.pictures.corpus import SUPERSAMPLING, VIEW_SIZE, RayCaster
+from fd_mitsuba.prior.pictures.corpus import SUPERSAMPLING, VIEW_SIZE
 from fd_mitsuba.prior.pictures.light import Light, reflected
 from fd_mitsuba.render.tonemap import to_srgb
 
@@ -29,8 +32,14 @@ class Hits:
     """(N,) which closed piece of the part; -1 on the base."""
 
 
+class Traced(Protocol):
+    """What `RayCaster` is to `visible`."""
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+
+
 def visible(
-    rays: tuple[np.ndarray, np.ndarray], base_hits: tuple[np.ndarray, np.ndarray], caster: RayCaster, pieces: np.ndarray
+    rays: tuple[np.ndarray, np.ndarray], base_hits: tuple[np.ndarray, np.ndarray], caster: Traced, pieces: np.ndarray
 ) -> Hits:
     """What rays (N, 3), (N, 3) show of a base, whose hits are known, and of a part with these pieces a face."""
     (origins, directions), (distance, normal) = rays, base_hits
@@ -135,14 +144,18 @@ def _latent(pixel: np.ndarray, colour: np.ndarray, fourth: np.ndarray) -> np.nda
     return np.clip(np.rint((2 * both - 1) * 127), -127, 127).astype(np.int8)
 
 
+def sum_of(slices: Iterable[np.ndarray]) -> np.ndarray:
+    """The slices added up one after another: numpy's mean over two short axes takes six times as long."""
+    return reduce(np.add, slices)
+
+
 def _tiled(pixel: np.ndarray, values: np.ndarray) -> np.ndarray:
     """The mosaic (C, 64, 64) of four views' values (N, C) at supersampled pixels, 0 elsewhere."""
     size, channels = VIEW_SIZE * SUPERSAMPLING, values.shape[1]
     canvas = np.zeros((4 * size * size, channels), np.float32)
     canvas[pixel] = values
-    # Sums of slices: numpy's mean over two short axes takes six times as long.
     canvas = canvas.reshape(4 * VIEW_SIZE, SUPERSAMPLING, size, channels)
-    canvas = sum(canvas[:, k] for k in range(SUPERSAMPLING)).reshape(-1, SUPERSAMPLING, channels)
-    canvas = sum(canvas[:, k] for k in range(SUPERSAMPLING)) / np.float32(SUPERSAMPLING**2)
+    canvas = sum_of(canvas[:, k] for k in range(SUPERSAMPLING)).reshape(-1, SUPERSAMPLING, channels)
+    canvas = sum_of(canvas[:, k] for k in range(SUPERSAMPLING)) / np.float32(SUPERSAMPLING**2)
     rows = canvas.reshape(2, 2, VIEW_SIZE, VIEW_SIZE, channels)
     return rows.transpose(4, 0, 2, 1, 3).reshape(channels, 2 * VIEW_SIZE, 2 * VIEW_SIZE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from tokenizers import Regex, normalizers
@@ -13,7 +14,7 @@ from transformers import CLIPConfig, CLIPModel, CLIPTextConfig, CLIPVisionConfig
 
 from fd_mitsuba.guidance.builtin import SUMS_NAME
 from fd_mitsuba.prior.pictures.clip_corpus import PATCH, SIZE
-from fd_mitsuba.prior.training.model import TEXT_LENGTH, build_tokenizer
+from fd_mitsuba.prior.training.model import TEXT_LENGTH, build_tokenizer, token_numbers
 
 WIDTH, LAYERS, TEXT_LAYERS, HEADS, FEATURES = 128, 4, 2, 4, 128
 CONVENTIONS = {
@@ -43,15 +44,13 @@ def build_clip_tokenizer() -> PreTrainedTokenizerFast:
 
 def build_clip(tokenizer: PreTrainedTokenizerFast) -> CLIPModel:
     """The dual encoder with fresh weights; its picture positions start as waves, so that neighbours are alike."""
-    shared = {"hidden_size": WIDTH, "intermediate_size": 4 * WIDTH, "num_attention_heads": HEADS}
+    shared: dict[str, Any] = {"hidden_size": WIDTH, "intermediate_size": 4 * WIDTH, "num_attention_heads": HEADS}
     text = CLIPTextConfig(
         vocab_size=len(tokenizer),
         num_hidden_layers=TEXT_LAYERS,
         max_position_embeddings=TEXT_LENGTH,
-        bos_token_id=tokenizer.bos_token_id,
         # The text is read where this token comes first; with the library's default, 2, it would be read elsewhere.
-        eos_token_id=tokenizer.eos_token_id,
-        pad_token_id=tokenizer.pad_token_id,
+        **token_numbers(tokenizer),
         projection_dim=FEATURES,
         **shared,
     )

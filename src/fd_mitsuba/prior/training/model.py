@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
@@ -108,8 +109,13 @@ def load_packed(
     before = json.loads((packed / "scheduler" / "scheduler_config.json").read_text(encoding="utf-8"))["prediction_type"]
     if {before, prediction_type} == {"v_prediction", "sample"}:
         with torch.no_grad():
-            for parameter in modules["unet"].conv_out.parameters():
+            for parameter in modules["unet"].get_submodule("conv_out").parameters():
                 parameter.neg_()
+
+
+def token_numbers(tokenizer: PreTrainedTokenizerFast) -> dict[str, Any]:
+    """What a CLIP text config asks of a tokenizer."""
+    return {name: getattr(tokenizer, name) for name in ("bos_token_id", "eos_token_id", "pad_token_id")}
 
 
 def build_text_encoder(tokenizer: PreTrainedTokenizerFast, width: int = TEXT_WIDTH, layers: int = 2) -> CLIPTextModel:
@@ -123,9 +129,7 @@ def build_text_encoder(tokenizer: PreTrainedTokenizerFast, width: int = TEXT_WID
             num_hidden_layers=layers,
             num_attention_heads=4,
             max_position_embeddings=TEXT_LENGTH,
-            bos_token_id=tokenizer.bos_token_id,
-            eos_token_id=tokenizer.eos_token_id,
-            pad_token_id=tokenizer.pad_token_id,
+            **token_numbers(tokenizer),
         )
     )
 
@@ -159,7 +163,7 @@ def build_scheduler(prediction_type: str) -> DDIMScheduler:
         beta_end=0.012,
         beta_schedule="scaled_linear",
         num_train_timesteps=1000,
-        prediction_type=prediction_type,
+        prediction_type=cast(Any, prediction_type),
         clip_sample=False,
         set_alpha_to_one=False,
         timestep_spacing="trailing",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import diffusers
 import torch
@@ -33,8 +34,9 @@ def pack(checkpoint: Path, folder: Path) -> None:
     if any("position_ids" not in key for key in missing):
         raise ValueError(f"{checkpoint}: lacks {missing}")
     folder.mkdir(parents=True, exist_ok=True)
-    modules["unet"].half().save_pretrained(folder / "unet")
-    modules["text_encoder"].half().save_pretrained(folder / "text_encoder")
+    for name in ("unet", "text_encoder"):
+        network: Any = modules[name].half()
+        network.save_pretrained(folder / name)
     kind.build_vae().half().save_pretrained(folder / "vae")
     tokenizer.save_pretrained(folder / "tokenizer")
     build_scheduler(kind.prediction).save_pretrained(folder / "scheduler")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,7 +60,8 @@ def train(
     if init is not None and state is None:
         load_start(init, modules, tokenizer, kind.prediction)
     modules.to(place)
-    modules["unet"].to(memory_format=torch.channels_last)
+    unet: Any = modules["unet"]
+    unet.to(memory_format=torch.channels_last)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     optimiser = torch.optim.AdamW(
         modules.parameters(), lr=kind.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True

@@ -9,6 +9,8 @@ partly covered ones only. The decoder inverts this up to the resolution.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from diffusers import AutoencoderTiny
 
@@ -21,7 +23,7 @@ def build_vae() -> AutoencoderTiny:
     """The autoencoder; a few hundred weights, each a closed form."""
     vae = blank_vae(5)
     with torch.no_grad():
-        _write_encoder(vae.encoder.layers)
+        _write_encoder(encoder_layers(vae))
         _write_decoder(decoder_convolutions(vae)[0])
     return vae
 
@@ -40,7 +42,7 @@ def blank_vae(channels: int) -> AutoencoderTiny:
     with torch.no_grad():
         for parameter in vae.parameters():
             parameter.zero_()
-        _first, _relu_block, *halvings, _to_latent = vae.encoder.layers
+        _first, _relu_block, *halvings, _to_latent = encoder_layers(vae)
         for k in range(channels):
             for halving in halvings:
                 # A stride-2 convolution padded by 1 sees rows 2i-1 .. 2i+1: the last two are the 2x2 block.
@@ -52,12 +54,17 @@ def blank_vae(channels: int) -> AutoencoderTiny:
     return vae.eval()
 
 
-def decoder_convolutions(vae: AutoencoderTiny) -> list[torch.nn.Conv2d]:
+def encoder_layers(vae: AutoencoderTiny) -> list[Any]:
+    """The encoder's layers, the one that reads the picture first; all but the second are convolutions with biases."""
+    return list(vae.encoder.layers)
+
+
+def decoder_convolutions(vae: AutoencoderTiny) -> list[Any]:
     """The decoder's convolutions, the one that reads the latent first."""
     return [layer for layer in vae.decoder.layers if isinstance(layer, torch.nn.Conv2d)]
 
 
-def _write_encoder(layers: torch.nn.Sequential) -> None:
+def _write_encoder(layers: list[Any]) -> None:
     colours_and_ramps, to_latent = layers[0], layers[-1]
     row, column = CENTRE
     for k in range(3):
@@ -71,7 +78,7 @@ def _write_encoder(layers: torch.nn.Sequential) -> None:
     to_latent.bias[3] = -1
 
 
-def _write_decoder(first: torch.nn.Conv2d) -> None:
+def _write_decoder(first: Any) -> None:
     row, column = CENTRE
     for k in range(3):
         first.weight[k, k, row, column] = 0.5  # c = (n m + m) / 2 with m = (latent_3 + 1) / 2

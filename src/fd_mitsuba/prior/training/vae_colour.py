@@ -9,14 +9,14 @@ from __future__ import annotations
 import torch
 from diffusers import AutoencoderTiny
 
-from fd_mitsuba.prior.training.vae import CENTRE, blank_vae, decoder_convolutions
+from fd_mitsuba.prior.training.vae import CENTRE, blank_vae, decoder_convolutions, encoder_layers
 
 
 def build_colour_vae() -> AutoencoderTiny:
     """The autoencoder; it takes and gives pictures 2 c - 1, as every Stable Diffusion VAE."""
     vae = blank_vae(3)
     row, column = CENTRE
-    first, to_latent = vae.encoder.layers[0], vae.encoder.layers[-1]
+    first, *_, to_latent = encoder_layers(vae)
     from_latent = decoder_convolutions(vae)[0]
     with torch.no_grad():
         for k in range(3):

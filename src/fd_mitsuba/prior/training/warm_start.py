@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import torch
 from diffusers import UNet2DConditionModel
@@ -32,8 +33,8 @@ def load_start(
     Raises:
         UserError: its UNet cannot be a start of this one.
     """
-    unet = modules["unet"]
-    small = UNet2DConditionModel.from_pretrained(str(packed / "unet"), local_files_only=True)
+    unet: Any = modules["unet"]
+    small: Any = UNet2DConditionModel.from_pretrained(str(packed / "unet"), local_files_only=True)
     levels, own_levels = tuple(small.config.block_out_channels), tuple(unet.config.block_out_channels)
     deeper = len(own_levels) - len(levels)
     load_packed(packed, modules, tokenizer, prediction_type, with_unet=deeper == 0)

@@ -8,7 +8,8 @@ from fd_mitsuba.prior.data.body import jitter
 from fd_mitsuba.prior.data.fine.headwear import Zones
 from fd_mitsuba.prior.data.fine.shapes import curve, disc, loop, sheet, strip, torus
 from fd_mitsuba.prior.data.fine.surface import Surface
-from fd_mitsuba.prior.data.primitives import box, ellipsoid, join, rotation, sweep, transform, tube
+from fd_mitsuba.prior.data.placed_parts import board
+from fd_mitsuba.prior.data.primitives import box, ellipsoid, join, rotation, transform, tube
 
 Rng = np.random.Generator
 
@@ -45,15 +46,8 @@ def skateboard(surface: Surface, rng: Rng) -> Zones:
     z = np.linspace(-1, 1, 21) * half_z
     rise = 0.22 * half_z * (np.clip(np.abs(z) / half_z - 0.68, 0, None) / 0.32) ** 1.5
     width = half_x * np.sqrt(np.clip(1.0 - np.clip((np.abs(z) / half_z - 0.7) / 0.31, 0, 1) ** 2.5, 0.01, None))
-    zero = np.zeros_like(z)
     centre = np.array([0, body.bottom - thick * 0.6, body.foot_centre_z])
-    deck = sweep(
-        centre + np.stack([zero, rise, z], 1),
-        np.stack([width, zero, zero], 1),
-        np.stack([zero, zero + thick, zero], 1),
-        16,
-        exponent=0.35,
-    )
+    deck = board(centre, np.stack([rise, z], 1), width, thick, 16, 0.35)
     wheels, trucks = [], []
     for sign in (1, -1):
         at = centre + (0, -thick, sign * half_z * 0.56)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fd_mitsuba.prior.data.primitives import Array, Solid, lathe, sweep, transform, tube
 
@@ -13,7 +14,7 @@ def unit(vector: Array) -> Array:
     return vector / (np.linalg.norm(vector, axis=-1, keepdims=True) + 1e-12)
 
 
-def frame_towards(direction: Array | tuple, forward: Array | tuple = (0.0, 0.0, 1.0)) -> Array:
+def frame_towards(direction: ArrayLike, forward: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """The rotation (3, 3) that takes +y to `direction` and +z as near to `forward` as that leaves it."""
     up = unit(np.asarray(direction, float))
     front = np.asarray(forward, float) - np.dot(forward, up) * up
@@ -24,7 +25,7 @@ def frame_towards(direction: Array | tuple, forward: Array | tuple = (0.0, 0.0, 
     return np.stack([np.cross(up, front), up, front], axis=1)
 
 
-def sheet(grid: Array, thickness: float | Array) -> Solid:
+def sheet(grid: Array, thickness: ArrayLike) -> Solid:
     """A closed thin solid about a grid of points (m, n, 3), half as thick at its border.
 
     Args:
@@ -62,7 +63,7 @@ def sheet(grid: Array, thickness: float | Array) -> Solid:
 
 
 def strip(
-    points: Array, width_direction: Array | tuple, half_widths: Array, half_thickness: Array | float, segments: int = 10
+    points: ArrayLike, width_direction: ArrayLike, half_widths: ArrayLike, half_thickness: ArrayLike, segments: int = 10
 ) -> Solid:
     """A band along points (n, 3), flat across: a feather, a blade, a strap. `half_widths` is (n,) or one number."""
     points = np.asarray(points, float)
@@ -76,7 +77,7 @@ def strip(
     return sweep(points, across * wide, over * thick, segments, exponent=0.8)
 
 
-def loop(points: Array, radii: Array | float, normal: Array | tuple, flatten: float = 1.0, segments: int = 10) -> Solid:
+def loop(points: ArrayLike, radii: ArrayLike, normal: ArrayLike, flatten: float = 1.0, segments: int = 10) -> Solid:
     """A closed tube through the points (n, 3), the last joined to the first.
 
     Args:
@@ -103,7 +104,7 @@ def loop(points: Array, radii: Array | float, normal: Array | tuple, flatten: fl
 
 
 def torus(
-    centre: Array | tuple, radius: float, thick: float, axis: Array | tuple = (0.0, 1.0, 0.0), flatten: float = 1.0
+    centre: ArrayLike, radius: float, thick: float, axis: ArrayLike = (0.0, 1.0, 0.0), flatten: float = 1.0
 ) -> Solid:
     """A ring about `axis`; `thick` is half its height along the axis, `flatten` times that its half-width across."""
     angle = np.arange(28) * (2 * np.pi / 28)
@@ -112,7 +113,7 @@ def torus(
     return loop(points + np.asarray(centre, float), thick, axis, flatten)
 
 
-def disc(centre: Array | tuple, radius: float, half_width: float, axis: Array | tuple = (1.0, 0.0, 0.0)) -> Solid:
+def disc(centre: ArrayLike, radius: float, half_width: float, axis: ArrayLike = (1.0, 0.0, 0.0)) -> Solid:
     """A cylinder with rounded edges about `axis`: a wheel, a button."""
     edge = min(0.3 * radius, 0.6 * half_width)
     profile = [
@@ -138,7 +139,7 @@ def turned(profile: list[tuple[float, float]], segments: int = 32) -> Solid:
     return lathe(np.array(kept), segments=segments)
 
 
-def curve(points: Array | list, count: int) -> Array:
+def curve(points: ArrayLike, count: int) -> Array:
     """`count` points (count, 3) evenly spread on a smooth (Catmull-Rom) curve through the given ones."""
     points = np.asarray(points, float)
     padded = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
