@@ -12,6 +12,8 @@ import pygltflib as gltf
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture
 
+ROOT_NAME = "asset"
+"""Of the node above all others, in files whose unit is known."""
 _WRAP = {"repeat": gltf.REPEAT, "mirror": gltf.MIRRORED_REPEAT, "clamp": gltf.CLAMP_TO_EDGE}
 _COMPONENT = {"f4": gltf.FLOAT, "u4": gltf.UNSIGNED_INT, "u2": gltf.UNSIGNED_SHORT}
 _SHAPE = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4}
@@ -47,8 +49,12 @@ class GltfMesh:
     extras: dict[str, Any] = field(default_factory=dict)
 
 
-def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
-    """A GLB of the meshes, in their order; `extras` goes to the scene."""
+def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any], metres: float | None = None) -> bytes:
+    """A GLB of the meshes, in their order; `extras` goes to the scene.
+
+    Args:
+        metres: how many a unit of the meshes is: all nodes then hang below one node `ROOT_NAME` with that scale.
+    """
     writer = _Writer()
     parents: dict[str, int] = {}
     roots: list[int] = []
@@ -61,6 +67,11 @@ def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
             parents[mesh.parent] = writer.append("nodes", gltf.Node(name=mesh.parent, children=[]))
             roots.append(parents[mesh.parent])
         writer.file.nodes[parents[mesh.parent]].children.append(node)
+    if metres is not None:
+        root = gltf.Node(name=ROOT_NAME, children=roots)
+        if metres != 1:
+            root.scale = [metres] * 3
+        roots = [writer.append("nodes", root)]
     return writer.finish(roots, extras)
 
 
@@ -157,7 +168,7 @@ class _Writer:
             name=material.name,
             pbrMetallicRoughness=surface,
             doubleSided=material.double_sided,
-            alphaMode=gltf.OPAQUE if material.opacity == 1 else gltf.BLEND,
+            alphaMode=material.alpha_mode,
             alphaCutoff=None,
             extensions=self._extensions(material),
             extras={"notes": list(material.notes)} if material.notes else {},
@@ -198,8 +209,10 @@ class _Writer:
             place = self.append("samplers", sampler)
             self._textures[key] = self.append("textures", gltf.Texture(source=image, sampler=place))
         info: dict[str, Any] = {"index": self._textures[key], "texCoord": 0}
-        if picture.tiling != ((0.0, 0.0), (1.0, 1.0)):
+        if picture.tiling != ((0.0, 0.0), (1.0, 1.0)) or picture.rotation:
             offset, scale = picture.tiling
-            info["extensions"] = {"KHR_texture_transform": {"offset": list(offset), "scale": list(scale)}}
+            turned = {"rotation": picture.rotation} if picture.rotation else {}
+            transform = {"offset": list(offset), **turned, "scale": list(scale)}
+            info["extensions"] = {"KHR_texture_transform": transform}
             self._uses(info["extensions"])
         return info
