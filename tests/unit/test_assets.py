@@ -6,6 +6,7 @@ import io
 import json
 import struct
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -416,6 +417,35 @@ def test_a_glb_is_in_metres_and_turns_parts_about_their_joint(load: Load, return
     pivot = part.to_asset[:3, 3] / 0.01
     # The ball floats above the head of the figure: its joint is the nearest point of that.
     assert part.name == "part_part" and np.allclose(pivot[[0, 2]], centre[[0, 2]], atol=0.05) and pivot[1] < centre[1]
+
+
+def test_a_print_is_one_watertight_solid_in_millimetres(load: Load, tmp_path: Path) -> None:
+    scene = load("box.glb")
+    vertices, faces = made.ball((1, 1, 1), (0, 1, 0), 24)  # half of it is in the box, whose top is at 1
+    part = PartAsset(vertices.astype(np.float64), faces)
+    export_assets(scene, RunConfig(), {"part": part}, tmp_path, ["print"], 64)
+    solid = trimesh.load_mesh(tmp_path / "print" / "asset.stl")
+    ball = trimesh.Trimesh(vertices, faces).volume
+    assert solid.is_watertight and np.isclose(solid.volume, (8 + ball / 2) * 1e9, rtol=1e-3)  # of metres
+    assert np.allclose(solid.bounds, [[-1000, -1000, -1000], [1000, 1000, 2000]], atol=0.1)  # z upwards
+    with zipfile.ZipFile(tmp_path / "print" / "asset.3mf") as archive:
+        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+    space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
+    assert model.get("unit") == "millimeter"
+    points = np.array([[float(item.get(axis, "")) for axis in "xyz"] for item in model.findall(".//m:vertex", space)])
+    corners = [[int(item.get(key, "")) for key in ("v1", "v2", "v3")] for item in model.findall(".//m:triangle", space)]
+    assert np.isclose(trimesh.Trimesh(points, corners).volume, solid.volume, rtol=1e-6)
+
+
+def test_what_is_printed_is_closed(load: Load, tmp_path: Path) -> None:
+    vertices, faces = made.ball((0.2, 0.2, 0.2), (0, 1, 0), 6)
+    part = {"part": PartAsset(vertices.astype(np.float64), faces)}
+    export_assets(load("box.obj"), RunConfig(), part, tmp_path, ["print"], 64)  # two shapes, each of which is open
+    assert trimesh.load_mesh(tmp_path / "print" / "asset.stl").is_watertight
+    (tmp_path / "hole.obj").write_bytes((ASSETS / "star.obj").read_bytes().replace(b"f 1 11 12 2", b""))
+    scene = fd.load_scene(fd.import_asset(tmp_path / "hole.obj", tmp_path / "hole").scene)
+    with pytest.raises(UserError, match="not closed .4 boundary edges.*assembled.ply"):
+        export_assets(scene, RunConfig(), part, tmp_path / "out", ["print"], 64)
 
 
 @needs_validator
