@@ -15,7 +15,8 @@ from fd_mitsuba.cli.main import main
 ASSETS = Path(__file__).parents[1] / "data" / "assets"
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 NAMES = sorted(path.name for path in ASSETS.iterdir() if path.suffix in SUFFIXES)
-QUICK = ("figure.glb", "duck.stl")
+FEW = ["figure.glb", "duck.stl"]
+REST = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name not in FEW]
 SMALL = [
     "geometry.steps=2", "appearance.steps=2", "output.turntable_frames=2", "output.turntable_size=32",
     "output.texture_size=64", "geometry.lambda_sds=0", "appearance.lambda_sds=0",
@@ -27,9 +28,7 @@ def run(*arguments: object) -> int:
     return main(["run", *map(str, arguments), "-c", "smoke", *settings, "-q"])
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
-)
+@pytest.mark.parametrize("name", FEW + REST)
 def test_a_mesh_file_is_edited_in_one_command(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "runs" / "mine"
     given = [ASSETS / name, "--prompt", "a thing with a hat", "--at", "top", "-o", folder]
