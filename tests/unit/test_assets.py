@@ -6,6 +6,7 @@ import io
 import json
 import struct
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,11 @@ import fd_mitsuba as fd
 from fd_mitsuba.assets import gltf
 from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
+from fd_mitsuba.export.pictures import Picture
+from fd_mitsuba.export.scene_pictures import rgba_png
 from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 
@@ -217,7 +221,7 @@ def test_which_way_it_points_is_guessed_aloud(tmp_path: Path) -> None:
     vertices = load_edit_scene(imported.scene).base[0].vertices
     assert np.allclose(vertices[:, 1].min(), 0) and np.allclose(vertices[:, 1].max(), 53)
     assert vertices[np.argmax(vertices[:, 2]), 1] > 35  # the beak is in front, and high
-    assert "millimetres" in imported.scene.read_text()
+    assert load_edit_scene(imported.scene).unit == "mm"
     told = fd.import_asset(ASSETS / "duck.stl", tmp_path / "told", up="z", front="-y")
     assert not any("front" in line or "for up" in line for line in told.remarks)
     turned = load_edit_scene(told.scene).base[0].vertices
@@ -356,14 +360,14 @@ def test_an_image_of_an_mtl_is_never_read_from_elsewhere(tmp_path: Path) -> None
 
 
 @pytest.fixture(scope="module")
-def returned(load: Load, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def returned(load: Load, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """An asset's scene exported as GLB, with a ball as its part."""
 
-    def export(name: str) -> Path:
+    def export(name: str, **options: Any) -> Path:
         scene, folder = load(name), tmp_path_factory.mktemp("returned")
         vertices, faces = made.ball((0.1, 0.1, 0.1), (0, 0, 0), 6)
         part = PartAsset(vertices / scene.frame.scale + scene.frame.to_user(scene.regions[0].centre), faces)
-        export_assets(scene, RunConfig(), {"part": part}, folder, ["glb"], 64)
+        export_assets(scene, RunConfig(), {"part": part}, folder, [Choice.of("glb", options)], 64)
         return folder / "asset.glb"
 
     return export
@@ -382,11 +386,72 @@ def test_a_glb_comes_back_with_the_numbers_it_had(name: str, returned: Callable[
         assert _images(ASSETS / name)[0] in _images(path)  # the same file, byte for byte
 
 
+def test_alpha_and_transforms_of_uvs_come_back(returned: Callable[..., Path]) -> None:
+    for name in ("mask.glb", "apart.gltf", "transformed_uv.glb"):
+        before, after = (read_asset(path).materials[0] for path in (ASSETS / name, returned(name)))
+        assert (before.alpha_mode, before.double_sided) == (after.alpha_mode, after.double_sided)
+        assert np.isclose(before.opacity, after.opacity, atol=1e-3)
+        assert before.base_texture is not None and after.base_texture is not None
+        assert np.allclose(before.base_texture.to_uv, after.base_texture.to_uv, atol=1e-6)
+        if name != "apart.gltf":  # whose colours were multiplied into its picture
+            assert before.base_texture.image.data == after.base_texture.image.data
+
+
+def test_a_picture_gets_its_opacity_as_alpha() -> None:
+    """Where the two come from different files: of half the size, and neither 0 nor 1 alone."""
+    red = Picture("red", made.encoded(Image.new("RGB", (4, 4), made.RED)))
+    whole = Image.open(io.BytesIO(rgba_png(red.pixels(), np.array([[0, 255], [128, 64]], np.uint8))))
+    assert whole.mode == "RGBA" and whole.size == (4, 4)
+    assert np.array_equal(np.asarray(whole)[::2, ::2, 3], [[0, 255], [128, 64]])
+    assert (np.asarray(whole)[..., :3] == made.RED).all()
+
+
+def test_a_glb_is_in_metres_and_turns_parts_about_their_joint(load: Load, returned: Callable[..., Path]) -> None:
+    scene = load("figure.glb")
+    assert scene.unit == "m"
+    plain, small = read_asset(returned("figure.glb")), read_asset(returned("figure.glb", unit="cm", pivot=True))
+    for one, other in zip(plain.meshes, small.meshes, strict=True):
+        assert np.allclose(0.01 * one.placed()[0], other.placed()[0], atol=1e-7)
+    part = small.meshes[-1]
+    centre = scene.frame.to_user(scene.regions[0].centre)
+    pivot = part.to_asset[:3, 3] / 0.01
+    # The ball floats above the head of the figure: its joint is the nearest point of that.
+    assert part.name == "part_part" and np.allclose(pivot[[0, 2]], centre[[0, 2]], atol=0.05) and pivot[1] < centre[1]
+
+
+def test_a_print_is_one_watertight_solid_in_millimetres(load: Load, tmp_path: Path) -> None:
+    scene = load("box.glb")
+    vertices, faces = made.ball((1, 1, 1), (0, 1, 0), 24)  # half of it is in the box, whose top is at 1
+    part = PartAsset(vertices.astype(np.float64), faces)
+    export_assets(scene, RunConfig(), {"part": part}, tmp_path, ["print"], 64)
+    solid = trimesh.load_mesh(tmp_path / "print" / "asset.stl")
+    ball = trimesh.Trimesh(vertices, faces).volume
+    assert solid.is_watertight and np.isclose(solid.volume, (8 + ball / 2) * 1e9, rtol=1e-3)  # of metres
+    assert np.allclose(solid.bounds, [[-1000, -1000, -1000], [1000, 1000, 2000]], atol=0.1)  # z upwards
+    with zipfile.ZipFile(tmp_path / "print" / "asset.3mf") as archive:
+        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+    space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
+    assert model.get("unit") == "millimeter"
+    points = np.array([[float(item.get(axis, "")) for axis in "xyz"] for item in model.findall(".//m:vertex", space)])
+    corners = [[int(item.get(key, "")) for key in ("v1", "v2", "v3")] for item in model.findall(".//m:triangle", space)]
+    assert np.isclose(trimesh.Trimesh(points, corners).volume, solid.volume, rtol=1e-6)
+
+
+def test_what_is_printed_is_closed(load: Load, tmp_path: Path) -> None:
+    vertices, faces = made.ball((0.2, 0.2, 0.2), (0, 1, 0), 6)
+    part = {"part": PartAsset(vertices.astype(np.float64), faces)}
+    export_assets(load("box.obj"), RunConfig(), part, tmp_path, ["print"], 64)  # two shapes, each of which is open
+    assert trimesh.load_mesh(tmp_path / "print" / "asset.stl").is_watertight
+    (tmp_path / "hole.obj").write_bytes((ASSETS / "star.obj").read_bytes().replace(b"f 1 11 12 2", b""))
+    scene = fd.load_scene(fd.import_asset(tmp_path / "hole.obj", tmp_path / "hole").scene)
+    with pytest.raises(UserError, match="not closed .4 boundary edges.*assembled.ply"):
+        export_assets(scene, RunConfig(), part, tmp_path / "out", ["print"], 64)
+
+
 @needs_validator
-def test_what_was_imported_is_exported_without_a_fault(returned: Callable[[str], Path]) -> None:
-    assert not glb_faults(
-        *(returned(name) for name in ("box.glb", "figure.glb", "colours.glb", "maps.glb", "mask.glb"))
-    )
+def test_what_was_imported_is_exported_without_a_fault(returned: Callable[..., Path]) -> None:
+    names = ("figure.glb", "colours.glb", "maps.glb", "mask.glb", "apart.gltf")
+    assert not glb_faults(*map(returned, names), returned("transformed_uv.glb", unit="mm", pivot=True))
 
 
 @needs_validator

@@ -124,7 +124,7 @@ def a_unit_shape_is_closed_and_encloses_its_volume(name: str) -> None:
     assert TriangleMesh(name, vertices, faces).volume() == pytest.approx(exact, rel=tolerance)
 
 
-@shows("exporters", "glb", "obj", "ply", "mitsuba")
+@shows("exporters", "glb", "obj", "ply", "mitsuba", "print")
 def a_format_leaves_what_it_says(name: str) -> None:
     """`test_every_format_leaves_what_it_says_and_no_other_does` writes them; this is what they are."""
     assert EXPORTERS.entry(name, "here").make.leaves

@@ -16,12 +16,12 @@ from fd_mitsuba.assets.scene_writer import SceneText, write_scene
 from fd_mitsuba.assets.shapes import SceneShape, scene_shapes
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import size_problem
+from fd_mitsuba.scene.edit_inputs import UNITS
 from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
-UNITS = ("mm", "cm", "m")
 _MANY_SHAPES = 64
 
 
@@ -99,7 +99,8 @@ def import_file(
         prompt=prompt or words,
         base_prompt=base_prompt or _before_the_part(prompt) or words,
         light=light,
-        comment=_comment(path, units or asset.unit),
+        comment=f"Made of {path.name} by fd_mitsuba import.",
+        unit=units or asset.unit,
     )
     scene = write_scene(folder, shapes, to_scene, regions, text, notes)
     if len(shapes) > _MANY_SHAPES:
@@ -155,8 +156,3 @@ def _before_the_part(prompt: str | None) -> str | None:
     """The words of a prompt before "with" and the like, which name the object itself."""
     found = re.match(r"(.+?)\s+(?:with|wearing|carrying|holding|that has|which has)\s", prompt or "", re.IGNORECASE)
     return found[1] if found else None
-
-
-def _comment(path: Path, unit: str | None) -> str:
-    told = f"; its unit is {dict(mm='millimetres', cm='centimetres', m='metres')[unit]}" if unit else ""
-    return f"Made of {path.name} by fd_mitsuba import{told}."

@@ -29,12 +29,14 @@ class SceneText:
         prompt, base_prompt: of `dual_path`.
         light: an EXR file, which is copied.
         comment: of the scene's first line.
+        unit: "mm", "cm" or "m"; None: it is not known.
     """
 
     prompt: str
     base_prompt: str
     light: Path
     comment: str
+    unit: str | None = None
 
 
 def write_scene(
@@ -72,6 +74,8 @@ def write_scene(
     integrator = ElementTree.SubElement(root, "integrator", type="dual_path")
     ElementTree.SubElement(integrator, "string", name="prompt", value="$prompt")
     ElementTree.SubElement(integrator, "string", name="base_prompt", value=text.base_prompt.replace("$", r"\$"))
+    if text.unit is not None:
+        ElementTree.SubElement(integrator, "string", name="unit", value=text.unit)
     emitter = ElementTree.SubElement(root, "emitter", type="envmap", id="light")
     ElementTree.SubElement(emitter, "string", name="filename", value="$light")
     ElementTree.SubElement(emitter, "float", name="scale", value="$light_scale")

@@ -16,6 +16,7 @@ from fd_mitsuba.export.base_shapes import base_shapes
 from fd_mitsuba.export.cut_shapes import CutBase
 from fd_mitsuba.export.formats import EXPORTERS, FORMATS, ExportContent, Exporter, shape_name
 from fd_mitsuba.export.meshes import copy_base
+from fd_mitsuba.export.printing import Print
 from fd_mitsuba.export.ready_part import PartAsset, ready_part
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -23,6 +24,10 @@ from fd_mitsuba.scene.part_stack import SHOWN, read_stack
 from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+
+PRINT = Print.leaves
+"""Of the format `print`, which is registered by its module being imported here, after those that are written by
+default."""
 
 
 def export_assets(

@@ -6,11 +6,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from fd_mitsuba.config.registry import Registry
+from fd_mitsuba.config.sections import Section
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.export.bake.tangents import vertex_tangents
 from fd_mitsuba.export.base_shapes import BaseShape
@@ -18,10 +19,13 @@ from fd_mitsuba.export.cut_shapes import CutBase
 from fd_mitsuba.export.gltf import GltfMesh, glb_bytes, is_placement
 from fd_mitsuba.export.mitsuba_files import write_mitsuba
 from fd_mitsuba.export.obj import ObjMesh, obj_files
+from fd_mitsuba.export.part_record import anchor
 from fd_mitsuba.export.ready_part import ReadyPart
+from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.io.safe_text import safe_name
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.part_stack import StackedPart
 
 
@@ -82,14 +86,32 @@ EXPORTERS: Registry[type[Exporter]] = Registry("exporters", "format")
 """Called with their settings."""
 
 
-@EXPORTERS.register("glb")
+Unit = Literal["mm", "cm", "m"]
+METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0}
+"""In a unit."""
+
+
+class GlbSettings(Section):
+    """Of `glb`."""
+
+    unit: Unit | None = None
+    """What a unit of the scene is, since glTF has metres: a node `asset` above all others scales by it. Default: what
+    the scene's `dual_path` says in `unit`; without that, numbers are written as they are."""
+    pivot: bool = False
+    """Whether a part's node lies where the part grows out of the base, so that it turns about its joint."""
+
+
+@EXPORTERS.register("glb", GlbSettings)
 class Glb(Exporter):
     """`asset.glb`: binary glTF 2 with a node a shape and a part."""
 
     leaves = "asset.glb"
 
     def write(self, content: ExportContent) -> None:
-        content.write(self.leaves, glb_bytes(_gltf_meshes(content), content.extras))
+        unit = self.settings.unit or content.scene.unit
+        extras = content.extras if unit is None else {**content.extras, "unit": "metre"}
+        meshes = _gltf_meshes(content, self.settings.pivot)
+        content.write(self.leaves, glb_bytes(meshes, extras, None if unit is None else METRES[unit]))
 
 
 @EXPORTERS.register("obj")
@@ -160,7 +182,12 @@ def _earlier_files(content: ExportContent) -> dict[str, Path]:
     return {name: file for name, file in files.items() if name not in changed and file.suffix == ".ply"}
 
 
-def _gltf_meshes(content: ExportContent) -> list[GltfMesh]:
+def _gltf_meshes(content: ExportContent, pivot: bool = False) -> list[GltfMesh]:
+    """The meshes.
+
+    Args:
+        pivot: put each part's node at its joint.
+    """
     meshes, origin, away = [], content.scene.origin, np.eye(4)
     away[:3, 3] = origin  # a GLB has 32 bits for positions, and 64 for a node's place
     earlier = {part.shape: part for part in content.scene.earlier}
@@ -186,20 +213,30 @@ def _gltf_meshes(content: ExportContent) -> list[GltfMesh]:
         mesh = part.mesh
         tangents = vertex_tangents(mesh.vertices, mesh.faces, mesh.normals, mesh.uv)
         about = {**content.extras, "part": part.name}
+        place = _joint(content.scene, mesh.vertices, mesh.faces) if pivot else origin
+        placed = np.eye(4)
+        placed[:3, 3] = place
         meshes.append(
             GltfMesh(
                 part.label,
-                mesh.vertices - origin,
+                mesh.vertices - place,
                 mesh.faces,
                 part.material,
                 mesh.normals,
                 mesh.uv,
                 tangents=tangents,
-                to_world=away,
+                to_world=placed,
                 extras=about,
             )
         )
     return meshes
+
+
+def _joint(scene: EditScene, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(3,) where a part grows out of the base, user frame."""
+    base = scene.base_canonical
+    solid = Solid(scene.frame.to_canonical(vertices), faces)
+    return scene.frame.to_user(anchor(solid, base, MeshDistance(base.vertices, base.faces))[0])
 
 
 def _obj_meshes(content: ExportContent) -> list[ObjMesh]:

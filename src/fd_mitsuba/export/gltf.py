@@ -13,6 +13,8 @@ from fd_mitsuba.export.export_mesh import ExportMesh
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.pictures import Picture
 
+ROOT_NAME = "asset"
+"""Of the node above all others, in files whose unit is known."""
 _WRAP = {"repeat": gltf.REPEAT, "mirror": gltf.MIRRORED_REPEAT, "clamp": gltf.CLAMP_TO_EDGE}
 _COMPONENT = {"f4": gltf.FLOAT, "u4": gltf.UNSIGNED_INT, "u2": gltf.UNSIGNED_SHORT}
 _SHAPE = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4}
@@ -36,8 +38,12 @@ class GltfMesh(ExportMesh):
     extras: dict[str, Any] = field(default_factory=dict)
 
 
-def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
-    """A GLB of the meshes, in their order; `extras` goes to the scene."""
+def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any], metres: float | None = None) -> bytes:
+    """A GLB of the meshes, in their order; `extras` goes to the scene.
+
+    Args:
+        metres: how many a unit of the meshes is: all nodes then hang below one node `ROOT_NAME` with that scale.
+    """
     writer = _Writer()
     children: dict[str, list[int]] = {}
     roots: list[int] = []
@@ -50,6 +56,11 @@ def glb_bytes(meshes: list[GltfMesh], extras: dict[str, Any]) -> bytes:
             children[mesh.parent] = []
             roots.append(writer.append("nodes", gltf.Node(name=mesh.parent, children=children[mesh.parent])))
         children[mesh.parent].append(node)
+    if metres is not None:
+        root = gltf.Node(name=ROOT_NAME, children=roots)
+        if metres != 1:
+            root.scale = [metres] * 3
+        roots = [writer.append("nodes", root)]
     return writer.finish(roots, extras)
 
 
@@ -146,7 +157,7 @@ class _Writer:
             name=material.name,
             pbrMetallicRoughness=surface,
             doubleSided=material.double_sided,
-            alphaMode=gltf.OPAQUE if material.opacity == 1 else gltf.BLEND,
+            alphaMode=material.alpha_mode,
             alphaCutoff=None,
             extensions=self._extensions(material),
             extras={"notes": list(material.notes)} if material.notes else {},
@@ -187,8 +198,10 @@ class _Writer:
             place = self.append("samplers", sampler)
             self._textures[key] = self.append("textures", gltf.Texture(source=image, sampler=place))
         info: dict[str, Any] = {"index": self._textures[key], "texCoord": 0}
-        if picture.tiling != ((0.0, 0.0), (1.0, 1.0)):
+        if picture.tiling != ((0.0, 0.0), (1.0, 1.0)) or picture.rotation:
             offset, scale = picture.tiling
-            info["extensions"] = {"KHR_texture_transform": {"offset": list(offset), "scale": list(scale)}}
+            turned = {"rotation": picture.rotation} if picture.rotation else {}
+            transform = {"offset": list(offset), **turned, "scale": list(scale)}
+            info["extensions"] = {"KHR_texture_transform": transform}
             self._uses(info["extensions"])
         return info

@@ -12,7 +12,7 @@ import pygltflib as gltf
 
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.gltf import is_placement
+from fd_mitsuba.export.gltf import ROOT_NAME, is_placement
 
 
 class Place(Protocol):
@@ -42,8 +42,10 @@ def instance_glb(asset: bytes, placements: Sequence[Place]) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = gltf.GLTF2.load_from_bytes(asset)
-    assert file is not None and file.scenes[0].nodes is not None  # `export.gltf` wrote it
-    sources = {file.nodes[number].name: number for number in file.scenes[0].nodes}
+    roots = file.scenes[0].nodes if file is not None else None
+    assert file is not None and roots is not None  # `export.gltf` wrote it
+    above = file.nodes[roots[0]] if len(roots) == 1 and file.nodes[roots[0]].name == ROOT_NAME else None
+    sources = {file.nodes[number].name: number for number in (roots if above is None else above.children or [])}
     before, file.nodes = file.nodes, []
     wanted: dict[str, list[np.ndarray]] = {}
     for placement in placements:
@@ -51,11 +53,14 @@ def instance_glb(asset: bytes, placements: Sequence[Place]) -> bytes:
             if name not in sources:
                 raise UserError(f"{name!r} is not in the exported GLB; export the run anew")
             wanted.setdefault(name, []).append(placement.to_world)
-    roots = [_copied(file, before, number) for name, number in sources.items() if name not in wanted]
+    nodes = [_copied(file, before, number) for name, number in sources.items() if name not in wanted]
     for name, places in wanted.items():
         for count, place in enumerate(places, 1):
-            roots.append(_placed(file, before, sources[name], place, f"_{count}"))
-    file.scenes[0].nodes = roots
+            nodes.append(_placed(file, before, sources[name], place, f"_{count}"))
+    if above is not None:  # which turns the scene's unit into metres
+        above.children, nodes = nodes, [len(file.nodes)]
+        file.nodes.append(above)
+    file.scenes[0].nodes = nodes
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return b"".join(file.save_to_bytes())
@@ -100,7 +105,12 @@ def _copied(
 
 
 def _matrix(node: gltf.Node) -> np.ndarray:
-    return np.eye(4) if node.matrix is None else np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+    if node.matrix is not None:
+        return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    if node.translation is not None:
+        matrix[:3, 3] = node.translation
+    return matrix
 
 
 def _column_major(matrix: np.ndarray) -> list[float]:

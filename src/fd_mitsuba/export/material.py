@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.export.pictures import Picture
-from fd_mitsuba.export.scene_pictures import colour_picture, grey_values, normal_picture, orm_picture
+from fd_mitsuba.export.scene_pictures import colour_picture, grey_values, normal_picture, opacity_picture, orm_picture
 from fd_mitsuba.scene.bsdf_reading import COLOURS, read_material
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 
+AlphaMode = Literal["OPAQUE", "MASK", "BLEND"]
 _WRAPPERS = ("twosided", "mask", "normalmap", "bumpmap", "blendbsdf")
 _TRANSPARENT = ("dielectric", "roughdielectric", "thindielectric", "principledthin")
 _EXACT = ("principled", "diffuse")
@@ -31,6 +32,7 @@ class PbrMaterial:
         normal_picture: tangent space, y up.
         colours: the mesh's colour attribute to multiply with, or "".
         colour_scale: what to multiply that with first.
+        alpha_mode: of glTF: how the alpha of `opacity` and `base_picture` is meant.
         notes: what the format cannot say, a sentence each.
     """
 
@@ -50,6 +52,7 @@ class PbrMaterial:
     normal_picture: Picture | None = None
     colours: str = ""
     colour_scale: float = 1.0
+    alpha_mode: AlphaMode = "OPAQUE"
     notes: tuple[str, ...] = ()
 
 
@@ -67,11 +70,14 @@ def pbr_material(file: SceneFile, element: SceneElement | None, name: str) -> Pb
     if element is None:
         return PbrMaterial(name, roughness=1.0, specular=0.0)
     material = PbrMaterial(name)
-    leaf, notes = element, []
+    leaf, notes, opacity = element, [], None
     while leaf.plugin in _WRAPPERS:
         nested = [child for child in _children(file, leaf).values() if child.kind == "bsdf"]
         if not nested:
             break
+        if leaf.plugin == "mask":
+            texture = _children(file, leaf).get("opacity")
+            opacity = texture if texture is not None and texture.plugin == "bitmap" else opacity
         material = _unwrapped(file, leaf, material, notes)
         leaf = nested[0]
     textures = {key: child for key, child in _children(file, leaf).items() if child.kind == "texture"}
@@ -82,12 +88,20 @@ def pbr_material(file: SceneFile, element: SceneElement | None, name: str) -> Pb
         material = replace(material, base_color=tuple(float(v) for v in np.clip(values["base_color"], 0, 1)))
     material = _lobes(leaf, material)
     material = _textured(file, leaf, textures, material, notes)
+    if opacity is not None:
+        material = with_opacity(file, opacity, material, notes)
     if leaf.plugin not in _EXACT:
         notes.append(f"nearest to Mitsuba's {leaf.plugin}")
     lost = [key for key in _LOST if key in leaf.properties or key in textures]
     if lost:
         notes.append(f"without {', '.join(lost)}")
     return replace(material, notes=tuple(notes))
+
+
+def with_opacity(file: SceneFile, texture: SceneElement, material: PbrMaterial, notes: list[str]) -> PbrMaterial:
+    """The material with a bitmap of opacities in the alpha of its base colour."""
+    picture, is_cut = opacity_picture(file, texture, material.base_picture, material.name, notes)
+    return replace(material, base_picture=picture, alpha_mode="MASK" if is_cut else "BLEND")
 
 
 def _children(file: SceneFile, element: SceneElement) -> dict[str, SceneElement]:
@@ -101,10 +115,13 @@ def _unwrapped(file: SceneFile, element: SceneElement, material: PbrMaterial, no
         return replace(material, double_sided=True)
     if element.plugin == "mask":
         opacity = element.properties.get("opacity", 0.5)
+        if "opacity" in children and children["opacity"].plugin == "bitmap":
+            return material
         if "opacity" in children or not isinstance(opacity, float):
             notes.append("the opacity is not constant and left out")
             return material
-        return replace(material, opacity=float(np.clip(opacity, 0, 1)))
+        opacity = float(np.clip(opacity, 0, 1))
+        return replace(material, opacity=opacity, alpha_mode="OPAQUE" if opacity == 1 else "BLEND")
     texture = children.get("normalmap")
     if element.plugin == "normalmap" and texture is not None and texture.plugin == "bitmap":
         return replace(material, normal_picture=normal_picture(file, texture, material.name, notes))

@@ -94,7 +94,10 @@ def _material_lines(name: str, material: PbrMaterial, files: dict[str, bytes]) -
     packed = material.orm_picture is not None
     lines += [f"Pr {1 if packed else material.roughness:.6g}", f"Pm {1 if packed else material.metallic:.6g}"]
     if material.base_picture is not None:
-        lines.append(f"map_Kd {_options(material.base_picture)}{_put(files, material.base_picture)}")
+        place = f"{_options(material.base_picture)}{_put(files, material.base_picture)}"
+        lines.append(f"map_Kd {place}")
+        if material.alpha_mode != "OPAQUE" and material.base_picture.alpha() is not None:
+            lines.append(f"map_d {place}")
     if material.orm_picture is not None:
         pixels = material.orm_picture.pixels()
         stem = material.orm_picture.name.removesuffix("_orm")

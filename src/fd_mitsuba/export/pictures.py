@@ -24,6 +24,7 @@ class Picture:
         wrap: "repeat", "mirror" or "clamp".
         nearest: no filtering.
         tiling: offset (u, v) and scale (u, v): looked up at offset + scale * uv.
+        rotation: radians by which scale * uv is turned first, as glTF's KHR_texture_transform means it.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Picture:
     wrap: str = "repeat"
     nearest: bool = False
     tiling: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (1.0, 1.0))
+    rotation: float = 0.0
 
     @property
     def file_name(self) -> str:
@@ -46,6 +48,13 @@ class Picture:
     def pixels(self) -> np.ndarray:
         """(H, W, 3) uint8 as stored."""
         return np.asarray(Image.open(io.BytesIO(self.data)).convert("RGB"))
+
+    def alpha(self) -> np.ndarray | None:
+        """(H, W) uint8; None where it has none."""
+        image = Image.open(io.BytesIO(self.data))
+        if image.mode not in ("RGBA", "LA"):
+            return None
+        return np.asarray(image.getchannel("A"))
 
 
 def srgb_from_linear(values: np.ndarray) -> np.ndarray:

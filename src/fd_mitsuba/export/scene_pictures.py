@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.errors import UserError
@@ -56,6 +59,41 @@ def orm_picture(
     return Picture(f"{name}_orm", png(packed_orm(*whole)), **_lookup(texture, notes))
 
 
+def opacity_picture(
+    file: SceneFile, texture: SceneElement, colours: Picture | None, name: str, notes: list[str]
+) -> tuple[Picture, bool]:
+    """A base colour picture with a bitmap of opacities as its alpha, and whether these are 0 and 1 alone.
+
+    The picture itself, byte for byte, where its own alpha says the same.
+
+    Args:
+        colours: the base colours so far; None: white.
+    """
+    alpha = np.round(np.clip(grey_values(file, texture)[..., 0], 0, 1) * 255).astype(np.uint8)
+    is_cut = bool(((alpha == 0) | (alpha == 255)).all())
+    look = _lookup(texture, notes)
+    if colours is None:
+        return Picture(f"{name}_base_color", rgba_png(np.full((1, 1, 3), 255, np.uint8), alpha), **look), is_cut
+    own = colours.alpha()
+    if own is not None and own.shape == alpha.shape:
+        cut = np.where(own >= 128, 255, 0)
+        if np.array_equal(own, alpha) or (is_cut and np.array_equal(cut, alpha)):
+            return colours, is_cut
+    if (colours.tiling, colours.rotation) != (look["tiling"], look["rotation"]):
+        notes.append("its opacity is taken to lie as its base colour does")
+    notes.append("the base colour's picture is written anew, with its opacity as alpha")
+    return replace(colours, data=rgba_png(colours.pixels(), alpha), suffix=".png"), is_cut
+
+
+def rgba_png(colours: np.ndarray, alpha: np.ndarray) -> bytes:
+    """A PNG of colours (H, W, 3) and alpha (h, w) in bytes, as large as the larger one."""
+    height, width = max(colours.shape[0], alpha.shape[0]), max(colours.shape[1], alpha.shape[1])
+    whole = [_resized(values, height, width) for values in (colours, alpha[..., None])]
+    stream = io.BytesIO()
+    Image.fromarray(np.concatenate(whole, axis=2).astype(np.uint8)).save(stream, format="PNG", compress_level=4)
+    return stream.getvalue()
+
+
 def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
     if not values.ndim:
         return np.full((height, width, 1), float(values))
@@ -101,11 +139,24 @@ def _lookup(texture: SceneElement, notes: list[str]) -> dict[str, Any]:
     properties = texture.properties
     transform = properties.get("to_uv")
     matrix = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), dtype=np.float64)
-    scale, offset = (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 3]), float(matrix[1, 3]))
-    if abs(matrix[0, 1]) + abs(matrix[1, 0]) > 1e-6:
-        notes.append("without the rotation of its UVs")
+    scale, rotation = _scale_and_rotation(matrix[:2, :2], notes)
+    offset = (float(matrix[0, 3]), float(matrix[1, 3]))
     return {
         "wrap": str(properties.get("wrap_mode", "repeat")),
         "nearest": properties.get("filter_type", "bilinear") == "nearest",
         "tiling": (offset, scale),
+        "rotation": rotation,
     }
+
+
+def _scale_and_rotation(matrix: np.ndarray, notes: list[str]) -> tuple[tuple[float, float], float]:
+    """Scales along u and v, and the rotation after them, of a map (2, 2) of UVs; a shear is left out."""
+    (a, b), (c, d) = matrix.tolist()
+    if abs(b) + abs(c) <= 1e-6:
+        return (a, d), 0.0
+    angle = float(np.arctan2(-c, a))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    along_u, along_v = float(np.hypot(a, c)), float(b * sine + d * cosine)
+    if abs(b - sine * along_v) + abs(d - cosine * along_v) > 1e-5 * max(abs(b), abs(d)):
+        notes.append("without the shear of its UVs")
+    return (along_u, along_v), angle

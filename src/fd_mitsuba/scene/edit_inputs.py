@@ -11,6 +11,9 @@ from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.xml_guard import scan_scene, uses
 
+UNITS = ("mm", "cm", "m")
+"""That a scene can say."""
+
 
 @dataclass(frozen=True)
 class EditInputs:
@@ -78,6 +81,20 @@ class EditInputs:
     def has_prompt(self) -> bool:
         """Whether there is an integrator to give one."""
         return any(item.plugin == DUAL_PATH for file in self.sources for item in file.top_level("integrator"))
+
+    def unit(self) -> str | None:
+        """What a unit of the scene is, "mm", "cm" or "m"; None where its integrator does not say.
+
+        Raises:
+            UserError: it says something else.
+        """
+        for element in self.scene.top_level("integrator"):
+            unit = element.properties.get("unit") if element.plugin == DUAL_PATH else None
+            if unit and unit not in UNITS:
+                raise element.error(f"unit {unit!r} is not known; write one of {', '.join(UNITS)}")
+            if unit:
+                return str(unit)
+        return None
 
     def part_bsdf(self) -> tuple[SceneFile, SceneElement | None]:
         """`<bsdf id="part">` and the file that it is in; None and the scene where there is none."""

@@ -59,6 +59,7 @@ class EditScene:
         regions_path: the file of regions beside the scene; None: the scene says itself.
         regions_parameters: the `-D` values that it was read with.
         earlier: the parts of earlier rounds, which are among the meshes of `base`.
+        unit: what a unit of the user frame is: "mm", "cm", "m", or None where the scene does not say.
         warnings: what is wrong with its files but was mended, and what Mitsuba warned of, a line each.
     """
 
@@ -78,6 +79,7 @@ class EditScene:
     regions_parameters: dict[str, str] = field(default_factory=dict)
     earlier: tuple[StackedPart, ...] = ()
     warnings: tuple[str, ...] = ()
+    unit: str | None = None
 
     @property
     def parts(self) -> dict[str, tuple[FocalRegion, ...]]:
@@ -223,6 +225,7 @@ def load_edit_scene(
         regions_path=inputs.regions.path if inputs.regions else None,
         regions_parameters=inputs.regions.parameters if inputs.regions else {},
         earlier=earlier,
+        unit=inputs.unit(),
         warnings=tuple(dict.fromkeys(line for source in inputs.sources for line in source.warnings)),
     )
 

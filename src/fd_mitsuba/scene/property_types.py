@@ -22,7 +22,7 @@ _BY_PLUGIN: dict[str, dict[str, str]] = {
     "mesh_attribute": {"name": TEXT, "scale": NUMBER},
     FOCAL_REGION: {name: TEXT for name in ("part", "mode", "prompt", "negative_prompt")},
     DUAL_PATH: {
-        **{name: TEXT for name in ("prompt", "base_prompt", "negative_prompt", "simple_prompt")},
+        **{name: TEXT for name in ("prompt", "base_prompt", "negative_prompt", "simple_prompt", "unit")},
         "only_these_regions": BOOLEAN,
     },
 }
