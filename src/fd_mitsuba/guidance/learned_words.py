@@ -24,7 +24,7 @@ def add_word(path: Path, tokenizer: Any, text_encoder: torch.nn.Module) -> tuple
     Raises:
         UserError: no such file, a damaged one or one of another kind, vectors of another width, a word that is known.
     """
-    file = lora_file(path)
+    file = lora_file(path, "guidance.words")
     word, vectors = _read(file)
     width = text_encoder.get_input_embeddings().weight.shape[1]
     if vectors.ndim != 2 or vectors.shape[1] != width:
