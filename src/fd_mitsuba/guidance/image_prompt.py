@@ -49,7 +49,8 @@ def add_image_prompt(config: GuidanceConfig, parts: dict[str, Any]) -> Tensor:
     state = _checked(file, parts["unet"], encoder)
     side = encoder.config.image_size
     processor = transformers.CLIPImageProcessor(size=side, crop_size=side)
-    pipeline = diffusers.StableDiffusionPipeline(
+    kind: Any = diffusers.StableDiffusionPipeline  # its signature has no None for what may be left out
+    pipeline = kind(
         **parts, safety_checker=None, feature_extractor=processor, image_encoder=encoder, requires_safety_checker=False
     )
     try:
@@ -71,7 +72,7 @@ def _picture(path: Path) -> Image.Image:
         raise UserError(f"{path}: {problem}; correct guidance.image_prompt") from None
 
 
-def _encoder(folder: Path) -> torch.nn.Module:
+def _encoder(folder: Path) -> Any:
     import transformers
 
     if not (folder / "config.json").is_file():
@@ -89,7 +90,7 @@ def _encoder(folder: Path) -> torch.nn.Module:
     return encoder.requires_grad_(False).eval()
 
 
-def _checked(file: Path, unet: torch.nn.Module, encoder: torch.nn.Module) -> dict[str, dict[str, Tensor]]:
+def _checked(file: Path, unet: Any, encoder: Any) -> dict[str, dict[str, Tensor]]:
     """The adapter's tensors as diffusers takes them."""
     from safetensors import SafetensorError, safe_open
 

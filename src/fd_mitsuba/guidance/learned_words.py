@@ -16,7 +16,7 @@ _UNNAMED = "emb_params"
 
 
 @torch.no_grad()
-def add_word(path: Path, tokenizer: Any, text_encoder: torch.nn.Module) -> tuple[str, str]:
+def add_word(path: Path, tokenizer: Any, text_encoder: Any) -> tuple[str, str]:
     """Add the word of a .safetensors file, or of a folder with one; returns it, and the tokens that stand for it.
 
     A word of several vectors has a token for each: `<cat>`, `<cat>_1`, ..., as in Diffusers.

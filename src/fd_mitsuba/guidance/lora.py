@@ -89,7 +89,7 @@ def lora_file(path: Path, setting: str = "guidance.lora") -> Path:
 _OTHER_MODEL = "it was made for another one; take a LoRA for the model that guidance.model names"
 
 
-def _by_flat_name(model: torch.nn.Module) -> dict[str, torch.nn.Module]:
+def _by_flat_name(model: torch.nn.Module) -> dict[str, torch.nn.Linear | torch.nn.Conv2d]:
     kinds = (torch.nn.Linear, torch.nn.Conv2d)
     return {name.replace(".", "_"): layer for name, layer in model.named_modules() if isinstance(layer, kinds)}
 
