@@ -246,6 +246,21 @@ def test_cost_of_a_real_model_follows_the_speed_of_its_device(
     assert any(said in assumption for assumption in with_it.assumptions)
 
 
+def test_cost_counts_the_passes_that_prompts_add(make_scene: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 passes a view; Perp-Neg one more, a part's own prompt another, and its own negative prompt one more again."""
+    monkeypatch.setattr("fd_mitsuba.guidance.speed.measured_speed", lambda *_: 688e6)  # a pass is then 1000 s
+    prompt, negative = '<string name="prompt" value="a hat"/>', '<string name="negative_prompt" value="a cap"/>'
+
+    def a_view(inner: str, *more: str) -> float:
+        region = ball("0.15", 0, 0.35, 0).replace("<transform", f"{inner}<transform")
+        chosen = ["guidance.model=a/b", "geometry.views=1", "geometry.coarse_fraction=1", *more]
+        return estimate_cost(load_edit_scene(make_scene(region=region)), RunConfig.load(None, chosen)).seconds_per_step
+
+    seconds = [a_view(""), a_view("", "guidance.perp_neg=1"), a_view(prompt), a_view(prompt + negative)]
+    assert [round(value / 1000) for value in seconds] == [2, 3, 3, 4]
+    assert round(a_view(prompt + negative, "guidance.guidance_scale=1") / 1000) == 2
+
+
 def test_the_built_in_prior_is_not_measured(make_scene: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that `check` of a shipped scene takes no longer."""
     monkeypatch.setattr("fd_mitsuba.guidance.speed.measured_speed", lambda *_: pytest.fail("measured all the same"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _PATIENCE = datetime.timedelta(days=1)
 """How long a process waits for the others: exports and pictures are made by one while the rest have nothing to do."""
+_POLITE_SECONDS = 60
 _SUMS = frozenset({"loss_sds", "guidance_loss", "part_pixels"})
 _MAXIMA = frozenset({"guidance_gradient_max"})
 """How the processes' values become those of the step; all others are averaged."""
@@ -116,6 +118,12 @@ def processes() -> Processes:
 def speaks_first() -> bool:
     """Whether this process tells the user what all processes of the machine find alike, such as bad input."""
     return not started_with_others() or os.environ.get("LOCAL_RANK", "0") == "0"
+
+
+def leave_the_word_to_the_first() -> None:
+    """In all processes but the first, wait before an error is told: where the first has the same, it ends them all."""
+    if not speaks_first():
+        time.sleep(_POLITE_SECONDS)
 
 
 def started_with_others() -> bool:

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import NoReturn
 
 from fd_mitsuba import __version__
-from fd_mitsuba.backend.processes import speaks_first
+from fd_mitsuba.backend.processes import leave_the_word_to_the_first, speaks_first
 from fd_mitsuba.cli.ablate import add_ablate_commands
 from fd_mitsuba.cli.batch import add_batch_commands
 from fd_mitsuba.cli.check import add_check_command
@@ -33,7 +33,7 @@ from fd_mitsuba.cli.prior import add_prior_commands
 from fd_mitsuba.cli.report import add_report_commands
 from fd_mitsuba.cli.run import add_run_command
 from fd_mitsuba.cli.studio import add_studio_command
-from fd_mitsuba.errors import Interrupted, RunStopped, UserError, out_of_memory, printable
+from fd_mitsuba.errors import Interrupted, UserError, out_of_memory, printable
 
 _LONGEST_USAGE = 300
 
@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
     except UserError as error:
         if verbose:
             raise
-        if speaks_first() or isinstance(error, RunStopped):
-            remark(f"error: {error}")
+        leave_the_word_to_the_first()
+        remark(f"error: {error}")
         return 1
     except (MemoryError, RuntimeError) as error:
         failure = out_of_memory(error)
@@ -86,7 +86,8 @@ def _exit_on_signals(options: argparse.Namespace) -> None:
     """
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{_interrupted(options)}\n".encode())
+        if speaks_first():
+            os.write(2, f"{_interrupted(options)}\n".encode())
         os._exit(130)
 
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -265,6 +265,14 @@ class GuidanceConfig(Section):
     """How much of each is added."""
     words: tuple[ModelName, ...] = ()
     """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
+    image_prompt: ModelName = ""
+    """A picture that the material shall be like, beside the prompt; appearance stage, through an IP-Adapter."""
+    ip_adapter: ModelName = ""
+    """The IP-Adapter's .safetensors file, or a folder with one; a plain one for the model."""
+    ip_adapter_encoder: ModelName = ""
+    """The folder of the image encoder that the IP-Adapter was made with."""
+    image_prompt_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
+    """How much the picture counts."""
     controlnet: ModelName = ""
     """A ControlNet's folder or hub id, which is shown the surface in the appearance stage; none by default."""
     controlnet_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0

@@ -33,6 +33,7 @@ class Denoiser:
         channels = components.unet.config.in_channels
         self.has_image_pass, self.inpaints = channels == 8, channels == 9
         self.needs_base = self.has_image_pass or self.inpaints
+        self.looks_at_picture = True
         self.adds_to_base = components.conventions.predicts == "difference"
         self.latent_size = latent_side(components.unet.config)
         self.alpha_bars = sds.levels(components.scheduler.alphas_cumprod).to(self.device)
@@ -73,11 +74,22 @@ class Denoiser:
             inputs = torch.cat([z_t.repeat(passes, 1, 1, 1), torch.cat(seen)], dim=1)
         elif passes > 1:
             inputs = z_t.repeat(passes, 1, 1, 1)
-        columns = inputs.to(unet.dtype), timesteps.repeat(passes), torch.cat(list(texts.values())).to(unet.dtype)
+        columns = {
+            "inputs": inputs.to(unet.dtype),
+            "times": timesteps.repeat(passes),
+            "texts": torch.cat(list(texts.values())).to(unet.dtype),
+        }
         if control is not None:
-            columns += z_t.repeat(passes, 1, 1, 1).to(unet.dtype), control.repeat(passes, 1, 1, 1).to(unet.dtype)
+            columns["z_t"] = z_t.repeat(passes, 1, 1, 1).to(unet.dtype)
+            columns["control"] = control.repeat(passes, 1, 1, 1).to(unet.dtype)
+        if self.components.image_prompt is not None:
+            columns["picture"] = self._pictures(tuple(texts), len(z_t)).to(unet.dtype)
         cores = cores_for_samples(unet, self.device)
-        outputs = of_samples(self._unet, columns, self.config.views_per_call, cores)
+
+        def call(*rows: Tensor) -> Tensor:
+            return self._unet(dict(zip(columns, rows, strict=True)))
+
+        outputs = of_samples(call, tuple(columns.values()), self.config.views_per_call, cores)
         if self.adds_to_base:
             outputs = outputs + torch.cat(seen)
         alpha_bar = self.alpha_bars[timesteps]
@@ -86,17 +98,35 @@ class Denoiser:
             for name, output in zip(texts, outputs.chunk(passes), strict=True)
         }
 
-    def _unet(
-        self, inputs: Tensor, times: Tensor, texts: Tensor, z_t: Tensor | None = None, control: Tensor | None = None
-    ) -> Tensor:
-        known: dict[str, Any] = {"encoder_hidden_states": texts, "return_dict": False}
-        if control is not None:
+    def _unet(self, rows: dict[str, Tensor]) -> Tensor:
+        known: dict[str, Any] = {"encoder_hidden_states": rows["texts"], "return_dict": False}
+        steered: dict[str, Any] = {}
+        if "control" in rows:
             assert self.components.controlnet is not None
             down, middle = self.components.controlnet(
-                z_t, times, controlnet_cond=control, conditioning_scale=self.config.controlnet_scale, **known
+                rows["z_t"],
+                rows["times"],
+                controlnet_cond=rows["control"],
+                conditioning_scale=self.config.controlnet_scale,
+                **known,
             )
-            known |= {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
-        return self.components.unet(inputs, times, **known)[0].float()
+            steered = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
+        if "picture" in rows:
+            steered["added_cond_kwargs"] = {"image_embeds": [rows["picture"]]}
+        return self.components.unet(rows["inputs"], rows["times"], **known, **steered)[0].float()
+
+    def _pictures(self, names: tuple[str, ...], count: int) -> Tensor:
+        """(passes count, 1, width): what is said of the picture in the pass with the prompt, zeros in the others.
+
+        Where the picture is not looked at, the adapter's layers are left out.
+        """
+        assert self.components.image_prompt is not None
+        scale = self.config.image_prompt_scale if self.looks_at_picture else 0.0
+        for processor in self.components.unet.attn_processors.values():
+            if hasattr(processor, "scale"):
+                processor.scale = [scale]
+        said = self.components.image_prompt.to(self.device)[None].expand(count, 1, -1)
+        return torch.cat([said if name == "text" else torch.zeros_like(said) for name in names])
 
     def passes(self, how: Distillation) -> tuple[str, ...]:
         """Names of the network's passes that the variant and the scales ask for."""

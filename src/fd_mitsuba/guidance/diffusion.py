@@ -198,6 +198,7 @@ class DiffusionGuidance(Denoiser):
         noise: Tensor,
         mask: Tensor | None = None,
     ) -> GuidanceResult:
+        self.looks_at_picture = phase == "appearance"
         how, count, (_, total) = self._how(phase), len(images), _share(views)
         total //= self.view_grid**2
         texts = self.embeddings(self.prompts(views), self.passes(how))

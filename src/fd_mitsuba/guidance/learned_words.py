@@ -16,7 +16,7 @@ _UNNAMED = "emb_params"
 
 
 @torch.no_grad()
-def add_word(path: Path, tokenizer: Any, text_encoder: torch.nn.Module) -> tuple[str, str]:
+def add_word(path: Path, tokenizer: Any, text_encoder: Any) -> tuple[str, str]:
     """Add the word of a .safetensors file, or of a folder with one; returns it, and the tokens that stand for it.
 
     A word of several vectors has a token for each: `<cat>`, `<cat>_1`, ..., as in Diffusers.
@@ -24,7 +24,7 @@ def add_word(path: Path, tokenizer: Any, text_encoder: torch.nn.Module) -> tuple
     Raises:
         UserError: no such file, a damaged one or one of another kind, vectors of another width, a word that is known.
     """
-    file = lora_file(path)
+    file = lora_file(path, "guidance.words")
     word, vectors = _read(file)
     width = text_encoder.get_input_embeddings().weight.shape[1]
     if vectors.ndim != 2 or vectors.shape[1] != width:

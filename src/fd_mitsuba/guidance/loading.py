@@ -14,6 +14,7 @@ from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 from fd_mitsuba.guidance.control import check_controlnet, locate_controlnet
+from fd_mitsuba.guidance.image_prompt import add_image_prompt, asks_for_image_prompt
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
     WEIGHTS,
@@ -52,6 +53,8 @@ class Components:
     words: dict[str, str] = field(default_factory=dict)
     """Learned words, and the tokens that stand for them."""
     controlnet: torch.nn.Module | None = None
+    image_prompt: torch.Tensor | None = None
+    """(1, width), what the image encoder says of the picture; the UNet has an IP-Adapter then."""
 
 
 def load_components(config: GuidanceConfig, device: str = "cpu", appearance: bool = False) -> Components:
@@ -73,9 +76,11 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     check_sizes(folder, configs, conventions)
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
-    if (config.lora or config.words or config.controlnet) and config.model == "builtin":
+    with_picture = asks_for_image_prompt(config)
+    if (config.lora or config.words or config.controlnet or with_picture) and config.model == "builtin":
         raise UserError(
-            "guidance.lora, words and controlnet are made for Stable Diffusion; set guidance.model to such a model"
+            "guidance.lora, words, image_prompt and controlnet are made for Stable Diffusion; set guidance.model to "
+            "such a model"
         )
     control, control_weights, control_variant = None, 0, None
     if config.controlnet:
@@ -102,7 +107,12 @@ def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     for path in config.lora:
         add_lora(Path(path).expanduser(), config.lora_scale, loaded.unet, loaded.text_encoder)
     words = [add_word(Path(path).expanduser(), loaded.tokenizer, loaded.text_encoder) for path in config.words]
-    return replace(loaded, words=dict(words))
+    picture = None
+    if asks_for_image_prompt(config):
+        names = ("vae", "text_encoder", "tokenizer", "unet", "scheduler")
+        with _quiet():
+            picture = add_image_prompt(config, {name: getattr(loaded, name) for name in names})
+    return replace(loaded, words=dict(words), image_prompt=picture)
 
 
 def locate(model: str, appearance: bool = False) -> Path:

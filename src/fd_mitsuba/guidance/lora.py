@@ -72,7 +72,7 @@ def add_lora(path: Path, scale: float, unet: torch.nn.Module, text_encoder: torc
     return len(planned)
 
 
-def lora_file(path: Path) -> Path:
+def lora_file(path: Path, setting: str = "guidance.lora") -> Path:
     """The .safetensors file of a path: itself, or the only one in a folder."""
     if path.is_dir():
         files = sorted(path.glob("*.safetensors"))
@@ -80,7 +80,7 @@ def lora_file(path: Path) -> Path:
             raise UserError(f"{path}: holds {len(files)} .safetensors files; name the one that is meant")
         return files[0]
     if not path.is_file():
-        raise UserError(f"{path}: no such file or folder; correct guidance.lora")
+        raise UserError(f"{path}: no such file or folder; correct {setting}")
     if path.suffix != ".safetensors":
         raise UserError(f"{path}: is no .safetensors file; others can run code as they are loaded, so convert it")
     return path
@@ -89,7 +89,7 @@ def lora_file(path: Path) -> Path:
 _OTHER_MODEL = "it was made for another one; take a LoRA for the model that guidance.model names"
 
 
-def _by_flat_name(model: torch.nn.Module) -> dict[str, torch.nn.Module]:
+def _by_flat_name(model: torch.nn.Module) -> dict[str, torch.nn.Linear | torch.nn.Conv2d]:
     kinds = (torch.nn.Linear, torch.nn.Conv2d)
     return {name.replace(".", "_"): layer for name, layer in model.named_modules() if isinstance(layer, kinds)}
 

@@ -24,6 +24,8 @@ LIT_PICTURES_SECONDS = 45.0
 _OPERATIONS_ELSEWHERE = {"float32": 3e13, "bfloat16": 6e13, "float16": 6e13}
 """Floating-point operations a second of a graphics card that is not here: they differ by a factor of ten and more."""
 _MOST_CORES_OF_USE = 16
+_CONTROLNET = 0.42
+"""Weights of a ControlNet over those of its UNet: 361 and 860 million for Stable Diffusion 1.5."""
 
 _SECONDS_PER_MILLION_FACES = 20.0
 """In each stage: search trees, signs of the grid, meshes to write."""
@@ -82,7 +84,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     weights, source = unet_weights(guidance.model)
     guided = geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
     speed = None if builtin or not guided else _speed(guidance)
-    passes = geometry.views * (2 if guidance.guidance_scale != 1 else 1)
+    passes = geometry.views * _passes(scene, guidance, guidance.guidance_scale)
     if speed is None:
         forward = encoder = 0.1 / 4 * 2 / cores  # four views are one picture to it; measured with two cores
     else:
@@ -109,7 +111,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     except UserError as error:
         warning = str(error)
     total = step * geometry.steps + START_AND_EXPORT_SECONDS + _SECONDS_PER_MILLION_FACES * more_faces
-    lit = _appearance_step(config, forward, encoder)
+    lit = _appearance_step(scene, config, forward, encoder)
     lit_total = lit * config.appearance.steps + LIT_PICTURES_SECONDS
     lit_total += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
     if left_out:
@@ -145,7 +147,18 @@ def _speed(guidance: GuidanceConfig) -> _Speed:
     return _Speed(unet, vae, f"networks on {device} at {rates}, {how}")
 
 
-def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float:
+def _passes(scene: EditScene, guidance: GuidanceConfig, scale: float) -> int:
+    """Passes of the network a view: with and without the prompt, and what negative and parts' own prompts add."""
+    own = scene.part_prompts.values()
+    passes = (2 if scale != 1 else 1) + len(own)
+    if guidance.perp_neg > 0:
+        passes += 1
+    if scale != 1 or guidance.perp_neg > 0:
+        passes += sum(text.negative_prompt not in ("", scene.negative_prompt) for text in own)
+    return passes
+
+
+def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encoder: float) -> float:
     """Seconds of a step of the appearance stage: fixed + light samples + passes of the networks.
 
     Fitted to `benchmarks/appearance_step.py` (0.5 s for 4 views of 128 x 128 pixels and 16 samples) and to runs of
@@ -161,7 +174,9 @@ def _appearance_step(config: RunConfig, forward: float, encoder: float) -> float
     samples = settings.views * side**2 * settings.spp
     depth = settings.max_depth if settings.max_depth > 0 else 8
     light = 3.4e-7 * samples * (1 + 0.5 * (depth - 2))
-    passes = settings.views * (2 if settings.guidance_scale != 1 else 1)
+    passes = settings.views * _passes(scene, config.guidance, settings.guidance_scale)
+    if config.guidance.controlnet:
+        passes *= 1 + _CONTROLNET
     # A prior in pixels needs no encoder; it is shown the part in clay as well.
     image = passes * forward + (0.3 * light if builtin else settings.views * encoder)
     return 0.15 + light + (0.03 if settings.style else 0.0) + (image if guided else 0.0)

@@ -68,14 +68,15 @@ def with_prompt(given: Guidance | AppearanceGuidance, scene: EditScene, say: Cal
         UserError: focal regions have prompts, and the guidance takes none of parts.
     """
     texts = texts_of_parts(scene)
-    if texts and not hasattr(given, "set_part_prompts"):
+    take_texts = getattr(given, "set_part_prompts", None)
+    if texts and take_texts is None:
         raise UserError(
             f"{scene.path}: part {next(iter(texts))!r} has a prompt of its own, which {type(given).__name__} cannot "
             "take; remove the prompts of the focal regions, or give the guidance set_part_prompts"
         )
     unknown = given.set_prompt(scene.prompt, scene.negative_prompt)
-    if texts:
-        given.set_part_prompts(texts)
+    if take_texts is not None:
+        take_texts(texts)
     if unknown:
         say(f"{type(given).__name__} does not know {', '.join(map(repr, unknown))}")
     return given

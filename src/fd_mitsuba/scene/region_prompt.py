@@ -42,7 +42,7 @@ def check_prompts(elements: list[SceneElement], regions: tuple[FocalRegion, ...]
         if region.prompt is None:
             continue
         other = first.setdefault(region.part, region)
-        if other.prompt != region.prompt:
+        if other.prompt is not None and other.prompt != region.prompt:
             raise element.error(
                 f"{region.name!r} and {other.name!r} grow one part, {region.part!r}, by different prompts "
                 f"({region.prompt.prompt!r}, {other.prompt.prompt!r}); give one of them another part"
