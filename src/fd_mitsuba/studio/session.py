@@ -11,6 +11,7 @@ name = session.grow()                   # queued; `session.queue` does it
 from __future__ import annotations
 
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -181,7 +182,15 @@ class Session:
         return result
 
     def _check_in_turn(self) -> None:
-        self.check_now()
+        try:
+            self.check_now()
+        except UserError as error:
+            self.check = LiveCheck(str(error))
+            self._tell("check")
+        except Exception:
+            traceback.print_exc()
+            self.check = LiveCheck("the check failed; the terminal has more about it")
+            self._tell("check")
 
     # Runs
 

@@ -57,6 +57,8 @@ class View:
                 self._refresh(topic)
             except UserError as error:
                 print(f"fd_mitsuba: {error}")
+            except Exception:  # whoever tells, such as the queue, goes on
+                traceback.print_exc()
 
     def _refresh(self, topic: str) -> None:
         session, panel, canvas = self.session, self.panel, self.canvas
