@@ -83,7 +83,7 @@ class Panel:
         self.region.on_update(self._heard(lambda event: session.select(event.target.value)))
         self.part = self._gui.add_text("Part", "part", hint="regions of one part grow together")
         self.centre = self._gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=1e-3)
-        longest = BASE_LONGEST_SIDE / state.scene.frame.scale
+        longest = BASE_LONGEST_SIDE / state.regions.frame.scale
         self.radii = [
             self._gui.add_slider(
                 f"Radius {axis}", _even(longest / 200), _even(longest * 0.6), longest / 1e4, longest / 10

@@ -98,7 +98,7 @@ class SceneSource:
         """The scene, from the work folder's copy; regions may lie wrong. UserError as `load_edit_scene`."""
         if not self.copy.is_file():
             raise UserError(f"{self.copy}: is gone; choose another -o folder")
-        return load_edit_scene(self.copy, self.parameters, None, prompt, on_misplaced=lambda error: None)
+        return load_edit_scene(self.copy, self.parameters, None, prompt, lambda error: None, needs_region=False)
 
     def snapshot(self, run: str, text: bytes) -> Path:
         """The scene file of a run, beside the copy, so that it reads the same meshes."""

@@ -63,12 +63,12 @@ class View:
     def _refresh(self, topic: str) -> None:
         session, panel, canvas = self.session, self.panel, self.canvas
         state = session.state
-        pose, frame = state.regions.poses.get(state.selected), state.scene.frame
+        pose, frame = state.regions.poses.get(state.selected), state.regions.frame
         poses, meshes = list(state.regions.poses.values()), list(state.regions.meshes.values())
         if topic == "scene":
             canvas.show_no_part()
             self._part_key = ""
-            canvas.show_base(state.glb, frame, state.scene.base_canonical)
+            canvas.show_base(state.glb, frame, state.base)
         if topic in ("scene", "regions"):
             canvas.show_regions(poses, meshes, frame)
         if topic in ("scene", "regions", "selected"):
@@ -84,6 +84,8 @@ class View:
             panel.show_settings()
         if topic == "check" and session.check is not None:
             panel.show_check(session.check)
+            if session.check.grid is not None:
+                canvas.show_grid(*(frame.to_canonical(np.array(corner)) for corner in session.check.grid))
         if topic in ("scene", "runs"):
             panel.show_runs()
             self._show_part()
@@ -93,7 +95,7 @@ class View:
         key = "" if run is None else shown_key(run)
         if key == self._part_key:
             return
-        frame = self.session.state.scene.frame
+        frame = self.session.state.regions.frame
         part = None if run is None else shown_part(run, frame)
         self._part_key, self._whole = key, part is not None and part.whole
         if part is None or not len(part.faces):
@@ -150,7 +152,7 @@ class View:
             state = session.state
             pose = state.regions.poses.get(state.selected)
             if pose is not None:
-                session.put(pose.moved(state.scene.frame.to_user(position), wxyz))
+                session.put(pose.moved(state.regions.frame.to_user(position), wxyz))
 
     def _visibility(self, event: Any) -> None:
         with self._lock:
