@@ -69,7 +69,9 @@ class Canvas:
     def show_grid(self, low: np.ndarray, high: np.ndarray) -> None:
         """The box (3,) to (3,) in which a part can grow, canonical frame."""
         box = (low + high) / 2 + (high - low) / 2 * _box_edges()
-        self._grid = self._scene.add_line_segments("/grid", box, _LINES, line_width=1.0, visible=self.visible["grid"])
+        self._grid = self._scene.add_line_segments(
+            "/grid", box, _LINES, thickness=1.0, thickness_units="screen", visible=self.visible["grid"]
+        )
 
     def show_base(self, glb: bytes, frame: Normalisation, soup: TriangleMesh) -> None:
         """The base, from a GLB in the user frame; `soup` is the same in the canonical frame, for its wires."""
@@ -82,10 +84,9 @@ class Canvas:
         """Whether a click on the base is heard."""
         if self._base is None:
             return
+        self._base.remove_click_callback("all")
         if wanted:
             self._base.on_click(lambda event: self._on_base(event))
-        else:
-            self._base.remove_click_callback("all")
 
     def show_regions(self, poses: Sequence[EllipsoidPose], meshes: Sequence[FocalRegion], frame: Normalisation) -> None:
         """All regions as glass; the gizmo stays as it is."""

@@ -32,7 +32,7 @@ class View:
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
         actions: dict[str, Callable[[Any], None]] = {
             "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]) and None,
-            "pick": lambda event: self.canvas.picking(True),
+            "pick": self._pick,
             "add": lambda event: session.add() and None,
             "remove": lambda event: session.remove(session.state.selected),
             "grow": lambda event: self._grow(session.grow),
@@ -129,7 +129,8 @@ class View:
         try:
             begin()
         finally:
-            self.panel.grow.disabled = False
+            check = self.session.check
+            self.panel.grow.disabled = check is not None and check.refusal is not None
 
     def _again(self) -> None:
         """Fields that hold what was refused go back to what is."""
@@ -138,6 +139,10 @@ class View:
 
     def _note(self, event: Any, text: str, color: Any = None) -> None:
         event.client.add_notification("fd_mitsuba", text, auto_close_seconds=_NOTE_SECONDS, color=color)
+
+    def _pick(self, event: Any) -> None:
+        self.canvas.picking(True)
+        self._note(event, "click on the base where the region shall be")
 
     def _clicked_region(self, name: str) -> None:
         self.session.select(name)
