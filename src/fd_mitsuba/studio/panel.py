@@ -6,7 +6,7 @@ drive each other in circles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -43,8 +43,8 @@ class Panel:
         self,
         server: viser.ViserServer,
         session: Session,
-        heard: Callable[[Callable[[Any], None]], Callable[[Any], None]],
-        actions: dict[str, Callable[[Any], None]],
+        heard: Callable[[Callable[[Any], object]], Callable[[Any], None]],
+        actions: Mapping[str, Callable[[Any], object]],
         visible: dict[str, bool],
     ) -> None:
         self.session, self._gui, self._heard, self._actions = session, server.gui, heard, actions
@@ -162,7 +162,7 @@ class Panel:
     def show_pose(self, pose: EllipsoidPose) -> None:
         """The numbers of the selected region."""
         self.part.value = pose.part
-        self.centre.value = tuple(round(value, 3) for value in pose.centre)
+        self.centre.value = np.round(pose.centre, 3)
         for slider, radius in zip(self.radii, pose.radii, strict=True):
             if radius > slider.max:
                 slider.max = _even(radius * 1.2)

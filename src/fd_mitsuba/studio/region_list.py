@@ -13,7 +13,7 @@ from fd_mitsuba.scene.focal_region import FocalRegion, PartPrompt
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import is_part_name
 from fd_mitsuba.scene.part_stack import free_name
-from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to
+from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to, vector
 from fd_mitsuba.studio.picking import Hit
 
 NEW_RADIUS = 0.22
@@ -102,7 +102,9 @@ class RegionList:
         centre = self.frame.to_user(np.asarray(point) + (1 - _SUNK) * NEW_RADIUS * np.asarray(normal))
         radius = NEW_RADIUS / self.frame.scale
         like = next(iter(self.focal_regions()), None)
-        pose = EllipsoidPose(free_name("region", self.names), tuple(centre.tolist()), turned_to(normal), (radius,) * 3)
+        pose = EllipsoidPose(
+            free_name("region", self.names), vector(centre), turned_to(normal), (radius, radius, radius)
+        )
         if like is not None:
             pose = replace(pose, part=like.part, mode=like.mode)
         self.poses[pose.name] = pose

@@ -55,7 +55,8 @@ class SceneSource:
             known = cls(
                 work,
                 work.path / str(record["copy"]),
-                *((work.path.resolve() / str(record[key])).resolve() for key in ("original", "first")),
+                (work.path.resolve() / str(record["original"])).resolve(),
+                (work.path.resolve() / str(record["first"])).resolve(),
                 {str(key): str(value) for key, value in record["parameters"].items()},
                 int(record["round"]),
             )

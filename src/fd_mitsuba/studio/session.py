@@ -125,7 +125,7 @@ class Session:
         vertices = self.state.base.vertices
         x, y, z = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         above, down = np.array([x, vertices[:, 1].max() + 1, z]), np.array([0.0, -1.0, 0.0])
-        if (name := self.add_at(above, down)) is not None:
+        if (name := self.add_at(above.tolist(), down.tolist())) is not None:
             return name
         return self._chosen(lambda regions: regions.add(above + down, -down))
 

@@ -30,10 +30,10 @@ class View:
         self._part_key = ""
         self._whole = False
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
-        actions: dict[str, Callable[[Any], None]] = {
-            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]) and None,
+        actions: dict[str, Callable[[Any], object]] = {
+            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]),
             "pick": self._pick,
-            "add": lambda event: session.add() and None,
+            "add": lambda event: session.add(),
             "remove": lambda event: session.remove(session.state.selected),
             "grow": lambda event: self._grow(session.grow),
             "another_seed": lambda event: self._grow(session.another_seed),
@@ -107,7 +107,7 @@ class View:
         self.canvas.base_hidden = self._whole
         self.canvas.apply_visibility()
 
-    def _heard(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _heard(self, handler: Callable[[Any], object]) -> Callable[[Any], None]:
         """The handler for what a person does: not called where the program itself set a field."""
 
         def call(event: Any) -> None:
