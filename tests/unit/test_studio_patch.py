@@ -111,6 +111,6 @@ def test_shipped_scenes_are_read_back_as_meant(scene: str, tmp_path: Path) -> No
     new.write_bytes(patched(data, "s", [turned, *poses[1:]], poses, list(regions.meshes)))
     after = load_edit_scene(new, on_misplaced=lambda error: None)
     points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
-    expected = FocalRegion("r", before.frame.matrix() @ turned.matrix).sdf(points)
+    expected = FocalRegion("r", after.frame.matrix() @ turned.matrix).sdf(points)
     assert after.regions[0].sdf(points) == pytest.approx(expected, abs=1e-5)
     assert [r.to_canonical.tolist() for r in after.regions[1:]] == [r.to_canonical.tolist() for r in before.regions[1:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import signal
 import sys
 import zipfile
 from pathlib import Path
@@ -65,7 +66,8 @@ def test_glb_of_the_part_alone() -> None:
 
 
 def test_base_glb_has_analytic_shapes_and_places(make_scene, mi) -> None:
-    ball = '<shape type="sphere" id="ball"><float name="radius" value="0.5"/><point name="center" x="3" y="0" z="0"/></shape>'
+    centre = '<point name="center" x="3" y="0" z="0"/>'
+    ball = f'<shape type="sphere" id="ball"><float name="radius" value="0.5"/>{centre}</shape>'
     scene = load_edit_scene(make_scene(extra=ball))
     found = trimesh.load(io.BytesIO(base_glb(scene)), file_type="glb")
     bounds = np.concatenate([mesh.vertices for mesh in scene.base])
@@ -132,6 +134,10 @@ def test_runner_tells_what_a_run_does(make_scene, mi, tmp_path: Path, monkeypatc
     monkeypatch.setattr(fd, "load_scene", lambda path, *_, prompt, **__: given.update(prompt=prompt, scene=path))
     monkeypatch.setattr(fd, "edit", edit)
     monkeypatch.setattr(runner, "_stop_on_signals", lambda events: None)
+    parents = iter([1, 1, 1])
+    monkeypatch.setattr(runner.os, "getppid", lambda: next(parents, 2))  # the studio is gone after two steps
+    signals = []
+    monkeypatch.setattr(runner.os, "kill", lambda process, number: signals.append(number))
     assert runner.main([str(run)]) == 0
     rows = list(EventReader(run).new())
     assert [row["step"] for row in rows if row["event"] == "mesh"] == [1, 10, 12]
@@ -139,6 +145,7 @@ def test_runner_tells_what_a_run_does(make_scene, mi, tmp_path: Path, monkeypatc
     assert rows[2]["losses"] == {"loss_sds": 0.33333}
     assert given["prompt"] == "a pig with a horn" and given["output"] == run and given["resume"] is False
     assert len(read_ply(run / "live" / "part.ply")[1]) == rows[-2]["faces"]
+    assert signals == [signal.SIGTERM]
     (run / "live" / "job.json").unlink()
     assert runner.main([str(run)]) == 1
     assert "job.json: is missing or damaged" in list(EventReader(run).new())[-1]["line"]

@@ -85,7 +85,10 @@ def test_check_reads_the_prompt_and_refuses(session: Session) -> None:
     with pytest.raises(UserError, match="prompt is blank"):
         session.save_scene()
     session.set_prompt("a pig with wings")
-    session.put(replace(session.state.regions.poses["wing"], centre=(0.0, 40.0, 0.0)))
+    wing = session.state.regions.poses["wing"]
+    session.put(replace(wing, centre=(0.0, 0.6, 0.0)))
+    assert "100% in the grid" in session.check_now().regions[0]  # the grid makes room
+    session.put(replace(wing, centre=(0.0, 40.0, 0.0)))
     assert "lies in the editable cube" in str(session.check_now().refusal)
     with pytest.raises(UserError, match="move or shrink it"):
         session.grow()
@@ -132,6 +135,17 @@ def test_save_scene_refuses_regions_that_changed_in_the_file(session: Session, s
     with pytest.raises(UserError, match="regions were changed since it was opened here; open it again"):
         session.save_scene()
     assert scene.read_bytes() == before
+
+
+def test_a_scene_without_regions_gets_its_first_one_here(make_scene, mi, tmp_path: Path) -> None:
+    scene = make_scene(region="")
+    session = opened(scene, tmp_path / "work")
+    assert session.state.selected == "" and "no region yet" in str(session.check_now().refusal)
+    session.add()
+    session.set_prompt("a pig with a horn")
+    session.save_scene()
+    session.close()
+    assert [region.name for region in load_edit_scene(scene).regions] == ["region"]
 
 
 def test_scene_that_was_edited_meanwhile_is_taken_anew(session: Session, scene: Path, tmp_path: Path) -> None:

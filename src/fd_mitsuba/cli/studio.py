@@ -7,15 +7,19 @@ import signal
 import threading
 from pathlib import Path
 
+from fd_mitsuba.cli.given_scene import is_asset, prepare_scene, scene_label
 from fd_mitsuba.cli.options import definitions, given_text, machine_options, remark, say, start
-from fd_mitsuba.cli.scene_options import settings_options
+from fd_mitsuba.cli.scene_options import axis_options, placing_options, settings_options
+from fd_mitsuba.errors import UserError
 
 
 def add_studio_command(commands: argparse._SubParsersAction) -> None:
     """Put `studio` beside the other commands."""
     studio = commands.add_parser("studio", help="place regions and see parts grow, in a browser")
     studio.add_argument(
-        "target", metavar="SCENE|RUN", help="Mitsuba scene file (XML), a run folder, or a work folder of the studio"
+        "scene",
+        metavar="SCENE|RUN",
+        help="Mitsuba scene file (XML), a mesh file, a run folder, or a work folder of the studio",
     )
     studio.add_argument(
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene"
@@ -29,8 +33,10 @@ def add_studio_command(commands: argparse._SubParsersAction) -> None:
     )
     studio.add_argument("-o", "--output", metavar="FOLDER", help="work folder; default: runs/studio_<scene>")
     settings_options(studio)
+    placing_options(studio)
+    axis_options(studio)
     machine_options(studio)
-    studio.set_defaults(call=_studio)
+    studio.set_defaults(call=_studio, regions=None)
 
 
 def _studio(options: argparse.Namespace) -> int:
@@ -50,7 +56,12 @@ def _studio(options: argparse.Namespace) -> int:
     from fd_mitsuba.studio.session import Session
 
     output = None if options.output is None else Path(options.output)
-    opened = open_target(Path(options.target), output, parameters, prompt, remark)
+    if is_asset(options.scene):
+        output = output or Path("runs") / f"studio_{scene_label(options.scene)}"
+    elif options.at:
+        raise UserError("--at: in the studio, a scene's regions are placed by a click on the base")
+    prepare_scene(options, output)
+    opened = open_target(Path(options.scene), output, parameters, prompt, remark)
     session = Session(opened, settings, options.threads, options.variant, say=remark)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

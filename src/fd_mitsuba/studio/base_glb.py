@@ -27,7 +27,8 @@ def base_glb(scene: EditScene) -> bytes:
 def only_parts(asset: bytes, parts: list[str]) -> bytes:
     """An exported GLB with nothing shown but the nodes `part_<name>` of these parts; buffers stay as they are."""
     file = gltf.GLTF2.load_from_bytes(asset)
+    assert file is not None
     wanted = {f"part_{name}" for name in parts} | {f"cut_face_{name}" for name in parts}
     scene = file.scenes[file.scene or 0]
-    scene.nodes = [index for index in scene.nodes if file.nodes[index].name in wanted]
+    scene.nodes = [index for index in scene.nodes or [] if file.nodes[index].name in wanted]
     return b"".join(file.save_to_bytes())

@@ -63,7 +63,15 @@ class Canvas:
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = CAMERA, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
         camera.fov = float(np.radians(FOV_DEG))
-        self._grid = self._scene.add_line_segments("/grid", _box_edges(GRID_HALF_EXTENT), _LINES, line_width=1.0)
+        half = np.full(3, GRID_HALF_EXTENT)
+        self.show_grid(-half, half)
+
+    def show_grid(self, low: np.ndarray, high: np.ndarray) -> None:
+        """The box (3,) to (3,) in which a part can grow, canonical frame."""
+        box = (low + high) / 2 + (high - low) / 2 * _box_edges()
+        self._grid = self._scene.add_line_segments(
+            "/grid", box, _LINES, thickness=1.0, thickness_units="screen", visible=self.visible["grid"]
+        )
 
     def show_base(self, glb: bytes, frame: Normalisation, soup: TriangleMesh) -> None:
         """The base, from a GLB in the user frame; `soup` is the same in the canonical frame, for its wires."""
@@ -76,10 +84,9 @@ class Canvas:
         """Whether a click on the base is heard."""
         if self._base is None:
             return
+        self._base.remove_click_callback("all")
         if wanted:
             self._base.on_click(lambda event: self._on_base(event))
-        else:
-            self._base.remove_click_callback("all")
 
     def show_regions(self, poses: Sequence[EllipsoidPose], meshes: Sequence[FocalRegion], frame: Normalisation) -> None:
         """All regions as glass; the gizmo stays as it is."""
@@ -211,14 +218,14 @@ def region_colour(number: int) -> tuple[int, int, int]:
     return _COLOURS[number % len(_COLOURS)]
 
 
-def _box_edges(half: float) -> np.ndarray:
-    """(12, 2, 3) the edges of a cube around the origin."""
+def _box_edges() -> np.ndarray:
+    """(12, 2, 3) the edges of the cube from -1 to 1."""
     edges = []
     for axis in range(3):
-        for a in (-half, half):
-            for b in (-half, half):
+        for a in (-1.0, 1.0):
+            for b in (-1.0, 1.0):
                 ends = np.full((2, 3), 0.0)
-                ends[:, axis] = (-half, half)
+                ends[:, axis] = (-1.0, 1.0)
                 ends[:, (axis + 1) % 3], ends[:, (axis + 2) % 3] = a, b
                 edges.append(ends)
     return np.array(edges)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.headroom import frame_with_headroom
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.studio.base_glb import base_glb
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.opening import Opened
@@ -61,8 +66,18 @@ class EditState:
         return cls(source, scene, base_glb(scene), regions, scene.prompt, settings, first, saved)
 
     def edited_scene(self) -> EditScene:
-        """The scene with the regions and the prompt as they are now."""
-        return replace(self.scene, regions=self.regions.focal_regions(), prompt=self.prompt)
+        """The scene with the regions and the prompt as they are now, in the frame that a run would have."""
+        paper, regions, soup = self.regions.frame, self.regions.focal_regions(), self.scene.base_soup
+        frame = frame_with_headroom(paper, soup.vertices[np.unique(soup.faces)], regions)
+        change = frame.matrix() @ np.linalg.inv(paper.matrix())
+        seen = regions if frame is paper else tuple(region.seen_from(change) for region in regions)
+        return replace(self.scene, regions=seen, frame=frame, prompt=self.prompt)
+
+    @cached_property
+    def base(self) -> TriangleMesh:
+        """All of the base's faces, in the frame of `regions`."""
+        soup = self.scene.base_soup
+        return TriangleMesh(soup.name, self.regions.frame.to_canonical(soup.vertices), soup.faces)
 
     def scene_text(self, text: bytes) -> bytes:
         """A scene file that has the regions of `saved`, with those and the prompt of now."""

@@ -21,6 +21,7 @@ class LiveCheck:
     regions: a line each: touching, in the grid, headroom.
     warnings: as of `check`.
     seconds: of the geometry stage and the appearance stage, roughly.
+    grid: corners of the cube in which a part can grow, user frame; it makes room for regions that stand out.
     """
 
     refusal: str | None = None
@@ -29,6 +30,7 @@ class LiveCheck:
     regions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     seconds: tuple[float, float] = (0.0, 0.0)
+    grid: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @property
     def estimate(self) -> str:
@@ -41,19 +43,24 @@ def live_check(scene: EditScene, config: RunConfig) -> LiveCheck:
     """The check of a scene whose regions or prompt a person has changed. Takes about a second; raises nothing."""
     if not scene.prompt:
         return LiveCheck("the prompt is blank; describe the edited object")
+    if not scene.regions:
+        return LiveCheck("there is no region yet; add one by a click on the base")
     refusal = _misplaced(scene)
     try:
         report = check_scene(scene, config)
     except UserError as error:
         return LiveCheck(refusal or str(error))
-    reading = report.prompt_reading
+    reading, parts = report.prompt_reading, report.part_readings
     return LiveCheck(
         refusal or report.refusal,
-        "" if reading is None else reading.summary(),
+        "; ".join(
+            [] if reading is None else [reading.summary(), *(f"{name}: {p.summary()}" for name, p in parts.items())]
+        ),
         "" if reading is None else reading.caption,
         tuple(_regions(scene, report)),
         report.warnings,
         (report.cost.seconds_total, report.cost.appearance_seconds_total),
+        (report.grid_low, report.grid_high),
     )
 
 

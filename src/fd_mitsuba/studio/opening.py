@@ -49,8 +49,10 @@ def open_target(
         return Opened(WorkFolder(target), None)
     if (target / "run.json").is_file() or (target / "live" / "job.json").is_file():
         return _run(target, output, say)
-    # An asset that is no scene (GLB, OBJ, ...) is imported here: from it comes the scene file that the rest works on.
-    scene = load_edit_scene(target, parameters, None, prompt, on_misplaced=lambda error: say(f"warning: {error}"))
+    # A mesh file was imported by the command; whatever else is to be opened becomes a scene file before it comes here.
+    scene = load_edit_scene(
+        target, parameters, None, prompt, lambda error: say(f"warning: {error}"), needs_region=False
+    )
     return Opened(WorkFolder(output or Path("runs") / f"studio_{_name(target)}"), scene)
 
 

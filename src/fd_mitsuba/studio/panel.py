@@ -6,9 +6,11 @@ drive each other in circles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
@@ -26,6 +28,7 @@ AXES = {"left - right (x)": 0, "below - above (y)": 1, "back - front (z)": 2}
 _REGION_BUTTONS = {"Add on top": "add", "Mirror": "mirror", "Remove": "remove"}
 _NO_RUN = "none yet"
 _MOST_LOSSES = 4
+_EMPTY_CHART = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
 
 
 class Panel:
@@ -40,8 +43,8 @@ class Panel:
         self,
         server: viser.ViserServer,
         session: Session,
-        heard: Callable[[Callable[[Any], None]], Callable[[Any], None]],
-        actions: dict[str, Callable[[Any], None]],
+        heard: Callable[[Callable[[Any], object]], Callable[[Any], None]],
+        actions: Mapping[str, Callable[[Any], object]],
         visible: dict[str, bool],
     ) -> None:
         self.session, self._gui, self._heard, self._actions = session, server.gui, heard, actions
@@ -80,7 +83,7 @@ class Panel:
         self.region.on_update(self._heard(lambda event: session.select(event.target.value)))
         self.part = self._gui.add_text("Part", "part", hint="regions of one part grow together")
         self.centre = self._gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=1e-3)
-        longest = BASE_LONGEST_SIDE / state.scene.frame.scale
+        longest = BASE_LONGEST_SIDE / state.regions.frame.scale
         self.radii = [
             self._gui.add_slider(
                 f"Radius {axis}", _even(longest / 200), _even(longest * 0.6), longest / 1e4, longest / 10
@@ -132,6 +135,14 @@ class Panel:
         self.shown.on_update(self._do("show"))
         self.status = self._gui.add_markdown("")
         self.bar = self._gui.add_progress_bar(0.0)
+        self.chart = self._gui.add_uplot(
+            _EMPTY_CHART,
+            ({}, {"label": "loss of the guidance", "stroke": "#c08000", "width": 1}),
+            scales={"x": {"time": False}},
+            legend={"show": False},
+            height=110,
+            visible=False,
+        )
         self.stop = self._button("Stop", "stop", icon="player-stop")
         self.resume = self._button("Resume", "resume", icon="player-play")
         self.format = self._gui.add_dropdown("Download as", list(FORMATS))
@@ -151,7 +162,7 @@ class Panel:
     def show_pose(self, pose: EllipsoidPose) -> None:
         """The numbers of the selected region."""
         self.part.value = pose.part
-        self.centre.value = tuple(round(value, 3) for value in pose.centre)
+        self.centre.value = np.round(pose.centre, 3)
         for slider, radius in zip(self.radii, pose.radii, strict=True):
             if radius > slider.max:
                 slider.max = _even(radius * 1.2)
@@ -193,13 +204,18 @@ class Panel:
         done = 0.0 if run is None or not run.total else 100.0 * run.step / run.total
         self.bar.value = 100.0 if state == FINISHED else done
         self.bar.animated = state in ACTIVE
+        rows = [] if run is None else [row[1:] for row in run.history if row[0] == run.stage]
+        self.chart.visible = len(rows) > 1 and state != FINISHED
+        if self.chart.visible:
+            self.chart.data = tuple(np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
         self.stop.visible = state in (*ACTIVE, QUEUED)
         self.resume.visible = state in RESUMABLE
         for handle in (self.format, self.download, self.again):
             handle.visible = state == FINISHED
 
     def _status(self, run: RunState) -> str:
-        place = self.session.queue.waiting.index(run.name) + 1 if run.name in self.session.queue.waiting else 0
+        waiting = self.session.queue.waiting
+        place = waiting.index(run.name) + 1 if run.name in waiting else 0
         lines = [f"**{run.sentence()}**" + (f" (place {place})" if place else "")]
         if run.state == RUNNING and run.losses:
             shown = list(run.losses.items())[:_MOST_LOSSES]

@@ -9,11 +9,11 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.focal_region import FocalRegion, PartPrompt
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import is_part_name
 from fd_mitsuba.scene.part_stack import free_name
-from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to
+from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to, vector
 from fd_mitsuba.studio.picking import Hit
 
 NEW_RADIUS = 0.22
@@ -26,29 +26,34 @@ _MOST_REGIONS = 32
 @dataclass
 class RegionList:
     """Attributes:
-    frame: of the base.
+    frame: of the base alone, so that it stays when regions move; the canonical frame of what is shown.
     poses: the ellipsoids by name, in the scene's order.
     meshes: regions that are no ellipsoids: shown, kept, and not to be changed here.
     taken: names of parts of earlier rounds.
+    prompts: of regions that have one of their own.
     """
 
     frame: Normalisation
     poses: dict[str, EllipsoidPose] = field(default_factory=dict)
     meshes: dict[str, FocalRegion] = field(default_factory=dict)
     taken: tuple[str, ...] = ()
+    prompts: dict[str, PartPrompt] = field(default_factory=dict)
 
     @classmethod
     def of_scene(cls, scene: EditScene) -> RegionList:
         """The regions as the scene has them."""
         taken = tuple(name for part in scene.earlier for name in (part.name, part.shape))
-        found = cls(scene.frame, taken=taken)
+        soup = scene.base_soup
+        found = cls(Normalisation.of_points(soup.vertices[np.unique(soup.faces)]), taken=taken)
         back = np.linalg.inv(scene.frame.matrix())
         for region in scene.regions:
+            if region.prompt is not None:
+                found.prompts[region.name] = region.prompt
             if region.is_ellipsoid:
                 matrix = back @ region.to_canonical
                 found.poses[region.name] = EllipsoidPose.of_matrix(region.name, matrix, region.part, region.mode)
             else:
-                found.meshes[region.name] = region
+                found.meshes[region.name] = region.seen_from(found.frame.matrix() @ back)
         return found
 
     @property
@@ -57,9 +62,10 @@ class RegionList:
         return [*self.poses, *self.meshes]
 
     def focal_regions(self) -> tuple[FocalRegion, ...]:
-        """As `EditScene` has them."""
-        matrix = self.frame.matrix()
-        ellipsoids = [FocalRegion(p.name, matrix @ p.matrix, p.part, None, p.mode) for p in self.poses.values()]
+        """As `EditScene` has them, in `frame`."""
+        matrix, own = self.frame.matrix(), self.prompts
+        poses = self.poses.values()
+        ellipsoids = [FocalRegion(p.name, matrix @ p.matrix, p.part, None, p.mode, own.get(p.name)) for p in poses]
         return (*ellipsoids, *self.meshes.values())
 
     def pose(self, name: str) -> EllipsoidPose:
@@ -96,7 +102,9 @@ class RegionList:
         centre = self.frame.to_user(np.asarray(point) + (1 - _SUNK) * NEW_RADIUS * np.asarray(normal))
         radius = NEW_RADIUS / self.frame.scale
         like = next(iter(self.focal_regions()), None)
-        pose = EllipsoidPose(free_name("region", self.names), tuple(centre.tolist()), turned_to(normal), (radius,) * 3)
+        pose = EllipsoidPose(
+            free_name("region", self.names), vector(centre), turned_to(normal), (radius, radius, radius)
+        )
         if like is not None:
             pose = replace(pose, part=like.part, mode=like.mode)
         self.poses[pose.name] = pose
@@ -107,10 +115,8 @@ class RegionList:
         return self.add(hit.point, hit.normal)
 
     def remove(self, name: str) -> None:
-        """Take an ellipsoid away; UserError for a mesh, or the last region."""
+        """Take an ellipsoid away; UserError for a mesh."""
         self.pose(name)
-        if len(self.names) == 1:
-            raise UserError("a scene needs a region; add another one first")
         del self.poses[name]
 
     def mirror(self, name: str, axis: int) -> EllipsoidPose:
@@ -133,6 +139,6 @@ class RegionList:
         """The ellipsoids of a record in place of the scene's; ValueError, TypeError or KeyError for a damaged one."""
         poses = [EllipsoidPose.of_json(dict(row)) for row in rows]  # type: ignore[call-overload]
         names = [pose.name for pose in poses]
-        if not poses and not self.meshes or len(set(names)) < len(names) or set(kept) != set(self.meshes):
+        if len(set(names)) < len(names) or set(kept) != set(self.meshes):
             raise ValueError("the regions do not fit the scene")
         self.poses = {pose.name: pose for pose in poses}

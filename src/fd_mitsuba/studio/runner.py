@@ -62,7 +62,7 @@ def _edit(order: RunOrder, folder: Path, events: EventWriter) -> None:
         variant=order.variant,
         plugins=config.plugins,
     )
-    started_by = os.getppid()
+    started_by, asked = os.getppid(), list[bool]()
 
     def on_step(update: StepUpdate) -> None:
         losses = {key: _short(value) for key, value in update.values.items() if key.startswith(("loss", "volume"))}
@@ -71,7 +71,8 @@ def _edit(order: RunOrder, folder: Path, events: EventWriter) -> None:
         )
         if update.stage == "geometry" and (update.step % MESH_EVERY == 0 or update.step in (1, update.total)):
             events.write("mesh", step=update.step, faces=_write_mesh(update.live, folder))
-        if os.getppid() != started_by:
+        if os.getppid() != started_by and not asked:
+            asked.append(True)  # once: a second signal would end the process before it has said so
             os.kill(os.getpid(), signal.SIGTERM)
 
     fd.edit(

@@ -55,7 +55,8 @@ class SceneSource:
             known = cls(
                 work,
                 work.path / str(record["copy"]),
-                *((work.path.resolve() / str(record[key])).resolve() for key in ("original", "first")),
+                (work.path.resolve() / str(record["original"])).resolve(),
+                (work.path.resolve() / str(record["first"])).resolve(),
                 {str(key): str(value) for key, value in record["parameters"].items()},
                 int(record["round"]),
             )
@@ -98,7 +99,7 @@ class SceneSource:
         """The scene, from the work folder's copy; regions may lie wrong. UserError as `load_edit_scene`."""
         if not self.copy.is_file():
             raise UserError(f"{self.copy}: is gone; choose another -o folder")
-        return load_edit_scene(self.copy, self.parameters, None, prompt, on_misplaced=lambda error: None)
+        return load_edit_scene(self.copy, self.parameters, None, prompt, lambda error: None, needs_region=False)
 
     def snapshot(self, run: str, text: bytes) -> Path:
         """The scene file of a run, beside the copy, so that it reads the same meshes."""

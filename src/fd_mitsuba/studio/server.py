@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import platform
 import secrets
 import socket
 import threading
@@ -56,7 +57,8 @@ class StudioServer:
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.session = session
         self.view = View(self.server, session)
-        shown = f"[{host}]" if ":" in host else host
+        named = platform.node() if host in ("0.0.0.0", "::") else host  # all addresses is none to open
+        shown = f"[{named}]" if ":" in named else named
         query = "" if guard.token is None else f"/?token={guard.token}"
         self.url = f"http://{shown}:{self.server.get_port()}{query}"
 

@@ -11,6 +11,7 @@ name = session.grow()                   # queued; `session.queue` does it
 from __future__ import annotations
 
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -116,15 +117,15 @@ class Session:
 
     def add_at(self, origin: Sequence[float], direction: Sequence[float]) -> str | None:
         """A new region where a ray of the canonical frame meets the base; its name, or None where it does not."""
-        hit = first_hit(self.state.scene.base_canonical, np.array(origin), np.array(direction))
+        hit = first_hit(self.state.base, np.array(origin), np.array(direction))
         return None if hit is None else self._chosen(lambda regions: regions.add_at(hit))
 
     def add(self) -> str:
         """A new region on top of the base's middle; its name."""
-        vertices = self.state.scene.base_canonical.vertices
+        vertices = self.state.base.vertices
         x, y, z = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         above, down = np.array([x, vertices[:, 1].max() + 1, z]), np.array([0.0, -1.0, 0.0])
-        if (name := self.add_at(above, down)) is not None:
+        if (name := self.add_at(above.tolist(), down.tolist())) is not None:
             return name
         return self._chosen(lambda regions: regions.add(above + down, -down))
 
@@ -181,7 +182,15 @@ class Session:
         return result
 
     def _check_in_turn(self) -> None:
-        self.check_now()
+        try:
+            self.check_now()
+        except UserError as error:
+            self.check = LiveCheck(str(error))
+            self._tell("check")
+        except Exception:
+            traceback.print_exc()
+            self.check = LiveCheck("the check failed; the terminal has more about it")
+            self._tell("check")
 
     # Runs
 

@@ -30,10 +30,10 @@ class View:
         self._part_key = ""
         self._whole = False
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
-        actions: dict[str, Callable[[Any], None]] = {
-            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]) and None,
-            "pick": lambda event: self.canvas.picking(True),
-            "add": lambda event: session.add() and None,
+        actions: dict[str, Callable[[Any], object]] = {
+            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]),
+            "pick": self._pick,
+            "add": lambda event: session.add(),
             "remove": lambda event: session.remove(session.state.selected),
             "grow": lambda event: self._grow(session.grow),
             "another_seed": lambda event: self._grow(session.another_seed),
@@ -57,16 +57,18 @@ class View:
                 self._refresh(topic)
             except UserError as error:
                 print(f"fd_mitsuba: {error}")
+            except Exception:  # whoever tells, such as the queue, goes on
+                traceback.print_exc()
 
     def _refresh(self, topic: str) -> None:
         session, panel, canvas = self.session, self.panel, self.canvas
         state = session.state
-        pose, frame = state.regions.poses.get(state.selected), state.scene.frame
+        pose, frame = state.regions.poses.get(state.selected), state.regions.frame
         poses, meshes = list(state.regions.poses.values()), list(state.regions.meshes.values())
         if topic == "scene":
             canvas.show_no_part()
             self._part_key = ""
-            canvas.show_base(state.glb, frame, state.scene.base_canonical)
+            canvas.show_base(state.glb, frame, state.base)
         if topic in ("scene", "regions"):
             canvas.show_regions(poses, meshes, frame)
         if topic in ("scene", "regions", "selected"):
@@ -82,6 +84,8 @@ class View:
             panel.show_settings()
         if topic == "check" and session.check is not None:
             panel.show_check(session.check)
+            if session.check.grid is not None:
+                canvas.show_grid(*(frame.to_canonical(np.array(corner)) for corner in session.check.grid))
         if topic in ("scene", "runs"):
             panel.show_runs()
             self._show_part()
@@ -91,7 +95,7 @@ class View:
         key = "" if run is None else shown_key(run)
         if key == self._part_key:
             return
-        frame = self.session.state.scene.frame
+        frame = self.session.state.regions.frame
         part = None if run is None else shown_part(run, frame)
         self._part_key, self._whole = key, part is not None and part.whole
         if part is None or not len(part.faces):
@@ -103,7 +107,7 @@ class View:
         self.canvas.base_hidden = self._whole
         self.canvas.apply_visibility()
 
-    def _heard(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _heard(self, handler: Callable[[Any], object]) -> Callable[[Any], None]:
         """The handler for what a person does: not called where the program itself set a field."""
 
         def call(event: Any) -> None:
@@ -125,7 +129,8 @@ class View:
         try:
             begin()
         finally:
-            self.panel.grow.disabled = False
+            check = self.session.check
+            self.panel.grow.disabled = check is not None and check.refusal is not None
 
     def _again(self) -> None:
         """Fields that hold what was refused go back to what is."""
@@ -134,6 +139,10 @@ class View:
 
     def _note(self, event: Any, text: str, color: Any = None) -> None:
         event.client.add_notification("fd_mitsuba", text, auto_close_seconds=_NOTE_SECONDS, color=color)
+
+    def _pick(self, event: Any) -> None:
+        self.canvas.picking(True)
+        self._note(event, "click on the base where the region shall be")
 
     def _clicked_region(self, name: str) -> None:
         self.session.select(name)
@@ -148,7 +157,7 @@ class View:
             state = session.state
             pose = state.regions.poses.get(state.selected)
             if pose is not None:
-                session.put(pose.moved(state.scene.frame.to_user(position), wxyz))
+                session.put(pose.moved(state.regions.frame.to_user(position), wxyz))
 
     def _visibility(self, event: Any) -> None:
         with self._lock:

@@ -43,9 +43,14 @@ class WorkFolder:
         return self.path / ("scene" if round_ == 1 else f"scene_{round_}")
 
     def next_run(self) -> Path:
-        """Where the next run goes: `001`, `002` and so on."""
+        """A folder for the next run, `001`, `002` and so on; it is made, so that nobody else gets it."""
         taken = [int(path.name) for path in self.runs.glob("[0-9]*") if path.name.isdecimal()]
-        return self.runs / f"{max(taken, default=0) + 1:03d}"
+        folder = self.runs / f"{max(taken, default=0) + 1:03d}"
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be made ({error.strerror or error}); free space there") from None
+        return folder
 
     def read(self) -> dict[str, Any] | None:
         """The record; None where there is no work folder yet.

@@ -1,0 +1,107 @@
+"""The page's two sides stay in step with the session, and do not drive each other in circles."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fd_mitsuba.io.ply import ply_bytes
+from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.studio.job import EventWriter
+from fd_mitsuba.studio.opening import open_target
+from fd_mitsuba.studio.session import Session
+from fd_mitsuba.studio.settings import StudioSettings
+
+viser = pytest.importorskip("viser")
+from fd_mitsuba.studio.view import View  # noqa: E402
+
+
+class Client:
+    """Stands for a tab: remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def add_notification(self, title: str, body: str, **options: Any) -> None:
+        self.notes.append(body)
+
+
+@pytest.fixture
+def view(make_scene, mi, tmp_path: Path) -> Iterator[View]:
+    opened = open_target(make_scene(), tmp_path / "work", {}, say=lambda line: None)
+    session = Session(opened, StudioSettings("smoke"), program=(sys.executable, "-I", "-c", ""))
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield View(server, session)
+    server.stop()
+    session.close()
+
+
+def typed(field: Any, value: Any, client: Client) -> None:
+    """As viser does when a client changes a field: the handle has the value, then the handlers are called."""
+    field._impl.value = value
+    for handler in field._impl.update_cb:
+        handler(SimpleNamespace(client=client, target=field))
+
+
+def test_gizmo_fields_and_regions_follow_each_other(view: View) -> None:
+    state, panel = view.session.state, view.panel
+    topics: list[str] = []
+    view.session.subscribe(topics.append)
+    place, half_turn = np.array([0.3, 0.5, -0.1]), np.array([0.0, 0.0, 1.0, 0.0])
+    view._gizmo_moved(place, half_turn)
+    pose = state.regions.poses["wing"]
+    assert state.regions.frame.to_canonical(np.array(pose.centre)) == pytest.approx(place)
+    assert panel.centre.value == pytest.approx(pose.centre, abs=6e-4)
+    assert view.canvas._regions["wing"].position == pytest.approx(place)
+    assert topics == ["pose"]  # setting the fields has called no handler of a person
+    typed(panel.radii[1], 0.4, Client())
+    assert state.regions.poses["wing"].radii == pytest.approx((0.12, 0.4, 0.15))
+    assert state.regions.poses["wing"].centre == pose.centre  # three digits of a field do not become the value
+    assert view.canvas._gizmo.position == pytest.approx(place)
+    assert topics == ["pose", "pose"]
+
+
+def test_refused_input_is_told_and_taken_back(view: View) -> None:
+    client = Client()
+    typed(view.panel.part, "a/b", client)
+    assert "cannot name a file" in client.notes[0] and view.panel.part.value == "part"
+    typed(view.panel.seed, -1, client)
+    assert "seed" in client.notes[1] and view.panel.seed.value == 0
+    typed(view.panel.part, "", client)  # while another name is being typed
+    assert len(client.notes) == 2 and view.session.state.regions.poses["wing"].part == "part"
+
+
+def test_growing_part_is_shown(view: View) -> None:
+    session = view.session
+    name = session.grow()
+    assert view.canvas._part is None and "waits for its turn" in view.panel.status.content
+    run = session.queue.runs[name]
+    vertices, faces = unit_sphere(2)
+    run.live_mesh.write_bytes(ply_bytes(vertices, faces))
+    events = EventWriter(run.folder)
+    losses = {"loss_sds": 2.0}
+    for step in (1, 2):
+        events.write("step", stage="geometry", phase="coarse", step=step, total=4, losses=losses)
+    events.write("mesh", step=1, faces=len(faces))
+    run.follow()
+    session._tell("runs")
+    shown = view.canvas._part
+    assert shown.vertices == pytest.approx(session.state.regions.frame.to_canonical(vertices), abs=1e-6)
+    assert "geometry, step 2 of 4" in view.panel.status.content and view.panel.bar.value == 50
+    assert view.canvas._regions["wing"].opacity < 0.2 and view.panel.stop.visible
+    view.canvas.visible["wireframe"] = True
+    view.canvas.apply_visibility()
+    assert view.canvas._wires["part"][2].wireframe and view.canvas._wires["base"][2].visible
+
+
+def test_selected_region_leaves_clicks_to_its_gizmo(view: View) -> None:
+    name = view.session.mirror("wing", 1)
+    assert view.canvas._clickable == {"wing"} and view.panel.region.value == name
+    view.session.select("wing")
+    assert view.canvas._clickable == {name}

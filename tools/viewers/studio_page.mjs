@@ -1,0 +1,109 @@
+// node studio_page.mjs grow|resume|picture URL FOLDER [JSON]: drives the page of `fd_mitsuba studio` in headless Chromium.
+// grow: drags the gizmo, types a prompt, grows, leaves as soon as the part is to be seen. resume: goes on, downloads.
+// picture: waits, and takes a picture. Prints as JSON what it saw; pictures and downloads go into FOLDER.
+import { mkdtemp, rm } from "node:fs/promises";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { chromium } from "playwright-core";
+
+const [action, url, folder, given = "{}"] = process.argv.slice(2);
+const options = JSON.parse(given);
+const profile = await mkdtemp(join(tmpdir(), "page-"));
+const quiet = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic", "--no-first-run"];
+const browser = await chromium.launchPersistentContext(profile, {
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  headless: true,
+  viewport: { width: options.width ?? 1280, height: options.height ?? 860 },
+  acceptDownloads: true,
+  timeout: 180000,
+  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", ...quiet],
+});
+browser.setDefaultTimeout(120000);
+const problems = [], foreign = [], said = {};
+
+async function tab() {
+  const page = await browser.newPage();
+  page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
+  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("request", (request) => /^(data|blob):/.test(request.url()) || request.url().startsWith(new URL(url).origin) || foreign.push(request.url()));
+  await page.goto(url, { timeout: 150000 });
+  await page.getByText("told to the prior").waitFor();
+  return page;
+}
+
+async function picture(page, name) {
+  await page.screenshot({ path: join(folder, `${name}.png`), timeout: 240000 });
+}
+
+const row = (page, label) => page.locator("div.mantine-Flex-root", { has: page.getByText(label, { exact: true }) }).last();
+const field = (page, label) => row(page, label).locator("input").first();
+const value = (page, label) => field(page, label).inputValue();
+const open = (page, name) => page.getByRole("tab", { name }).click();
+
+async function type(page, label, text) {
+  await field(page, label).fill(text);
+  await field(page, label).press("Enter");
+  await field(page, label).blur();
+}
+
+async function drag(page, from, to) {
+  await page.mouse.move(...from);
+  await page.waitForTimeout(500);
+  await page.mouse.down();
+  for (let step = 1; step <= 5; step++) {
+    await page.mouse.move(from[0] + ((to[0] - from[0]) * step) / 5, from[1] + ((to[1] - from[1]) * step) / 5);
+    await page.waitForTimeout(300);
+  }
+  await page.mouse.up();
+}
+
+try {
+  const started = Date.now();
+  const page = await tab();
+  said.interactive_seconds = (Date.now() - started) / 1000;
+  await page.locator(".mantine-Notification-closeButton").first().click({ timeout: 5000 }).catch(() => {});
+  await page.waitForTimeout(options.settle ?? 4000);
+  if (action === "grow") {
+    await picture(page, "opened");
+    const other = options.tabs > 1 ? await tab() : null;
+    await page.bringToFront();
+    if (options.drag) await drag(page, ...options.drag);
+    await type(page, "Prompt", options.prompt);
+    await page.getByText(options.told).waitFor();
+    if (other) {
+      await other.bringToFront(); // a tab in the background draws nothing
+      await other.getByText(options.told).waitFor();
+      said.prompt_of_other_tab = await value(other, "Prompt");
+      await other.close();
+    }
+    await open(page, "Grow");
+    if (options.steps) await type(page, "Steps", String(options.steps));
+    await page.waitForTimeout(1500);
+    await page.getByRole("button", { name: "Grow", exact: true }).click();
+    await page.getByText(/geometry, step/).waitFor();
+    await page.waitForTimeout(options.look ?? 4000);
+    said.text = await page.evaluate(() => document.body.innerText);
+    await picture(page, "growing");
+  } else if (action === "resume") {
+    await open(page, "Grow");
+    said.before = await page.evaluate(() => document.body.innerText);
+    await page.getByRole("button", { name: "Resume" }).click();
+    await page.getByText("finished", { exact: true }).waitFor({ timeout: options.patience ?? 600000 });
+    await page.waitForTimeout(options.settle ?? 4000);
+    await picture(page, "finished");
+    const waiting = page.waitForEvent("download");
+    await page.getByRole("button", { name: "Download" }).click();
+    const download = await waiting;
+    said.download = download.suggestedFilename();
+    await download.saveAs(join(folder, said.download));
+  } else {
+    if (options.tab) await open(page, options.tab);
+    await page.waitForTimeout(options.settle ?? 4000);
+    await picture(page, "page");
+    said.text = await page.evaluate(() => document.body.innerText);
+  }
+  console.log(JSON.stringify({ problems, foreign, ...said }));
+} finally {
+  await browser.close();
+  await rm(profile, { recursive: true, force: true });
+}
