@@ -4,8 +4,8 @@ A row for each part of each run folder; what was the training's own surface is i
 
     angle_p5, least     smallest angles of the triangles in degrees: 5th percentile, and the smallest of all
     off, off_max        distance of points on the triangles from the function's zero set, in cells of the training
-    volume              of the final surface over that of the training's, minus 1
-    noise               mean angle in degrees between the shading normals and smoothed ones
+    volume              outside of the base, over that of the training's surface, minus 1; sampled, to about .4 %
+    noise               mean angle in degrees between the shading normals and smoothed ones, outside of the base
     turn_p95            turning angle of the joint within a cell, 95th percentile, degrees
     notch               the deepest notch of the joint, in cells; curves counts closed curves
     charts, used        of the atlas: how many, and which share of the square they cover
@@ -27,17 +27,20 @@ sys.path[:0] = [str(ROOT / "src")]
 import numpy as np  # noqa: E402
 
 from fd_mitsuba.evaluation.joint import measure_joint  # noqa: E402
-from fd_mitsuba.evaluation.surface_quality import smallest_angles, surface_noise  # noqa: E402
 from fd_mitsuba.export.bake.chart_notches import charts_of  # noqa: E402
+from fd_mitsuba.export.bake.shading_noise import surface_noise  # noqa: E402
+from fd_mitsuba.export.bake.tangents import vertex_normals  # noqa: E402
 from fd_mitsuba.export.bake.unwrap import unwrap  # noqa: E402
 from fd_mitsuba.export.final_surface.final_part import final_part, part_function  # noqa: E402
 from fd_mitsuba.export.final_surface.projection import project  # noqa: E402
+from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles  # noqa: E402
 from fd_mitsuba.export.solid.part_solid import lattice_part, part_solid  # noqa: E402
+from fd_mitsuba.export.solid.solid import Solid  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.mesh_distance import MeshDistance  # noqa: E402
 
-_POINTS = 20_000
+_POINTS, _VOLUME_POINTS = 20_000, 300_000
 
 
 def measure(folder: Path) -> list[dict[str, Any]]:
@@ -69,9 +72,11 @@ def measure(folder: Path) -> list[dict[str, Any]]:
             "least": float(angles.min()),
             "off": float(off.mean()),
             "off_max": float(off.max()),
-            "volume": solid.volume / coarse.volume - 1,
-            "noise": surface_noise(solid.vertices, solid.faces, part.normals),
-            "noise_before": surface_noise(coarse.vertices, coarse.faces),
+            "volume": shown_volume(solid, base) / shown_volume(coarse, base) - 1,
+            "noise": surface_noise(solid.vertices, shown_faces(solid, base), part.normals),
+            "noise_before": surface_noise(
+                coarse.vertices, shown_faces(coarse, base), vertex_normals(coarse.vertices, coarse.faces)
+            ),
             "curves": joint.curves,
             "turn_p95": percentile(joint.turning_deg),
             "turn_before": percentile(was.turning_deg),
@@ -96,6 +101,21 @@ def spread(vertices: np.ndarray, faces: np.ndarray, random: np.random.Generator)
     return (weights[..., None] * corners[chosen]).sum(axis=1)
 
 
+def shown_faces(solid: Solid, base: MeshDistance) -> np.ndarray:
+    """The faces (F, 3) outside of the base."""
+    return solid.faces[~base.inside(solid.vertices)[solid.faces].any(axis=1)]
+
+
+def shown_volume(solid: Solid, base: MeshDistance) -> float:
+    """The volume outside of the base: of points on a lattice in the solid's bounds."""
+    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    step = (np.prod(high - low) / _VOLUME_POINTS) ** (1 / 3)
+    axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = points[MeshDistance(solid.vertices, solid.faces).inside(points)]
+    return float((~base.inside(points)).sum()) * step**3
+
+
 def percentile(values: np.ndarray) -> float:
     """The 95th; NaN without a curve."""
     return float(np.percentile(values, 95)) if len(values) else float("nan")
@@ -113,7 +133,8 @@ def main() -> None:
                 continue
             print(
                 f"{row['run']:12} faces {row['faces']:6} manifold {row['manifold']}  angle_p5 {row['angle_p5']:.1f} "
-                f"least {row['least']:.1f}  off {row['off']:.4f} max {row['off_max']:.3f}  volume {row['volume']:+.2%}  "
+                f"least {row['least']:.1f}  off {row['off']:.4f} max {row['off_max']:.3f}  "
+                f"volume {row['volume']:+.2%}  "
                 f"noise {row['noise']:.2f} ({row['noise_before']:.2f})  curves {row['curves']} "
                 f"turn_p95 {row['turn_p95']:.0f} ({row['turn_before']:.0f})  notch {row['notch']:.2f} "
                 f"({row['notch_before']:.2f})  gap {row['gap']:.2f}  charts {row['charts']} used {row['used']:.0%}  "

@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from skimage.measure import marching_cubes
 
-from fd_mitsuba.evaluation.surface_quality import smallest_angles
 from fd_mitsuba.export.final_surface.projection import project
 from fd_mitsuba.export.final_surface.remesh import remesh
+from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 
 Function = Callable[[np.ndarray], np.ndarray]

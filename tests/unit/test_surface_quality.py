@@ -7,7 +7,10 @@ import pytest
 from test_remesh import ball, cube, marched, remeshed
 
 from fd_mitsuba.evaluation.joint import joint_curves, measure_joint
-from fd_mitsuba.evaluation.surface_quality import smallest_angles, surface_noise
+from fd_mitsuba.export.bake.shading_noise import surface_noise, widened_roughness
+from fd_mitsuba.export.bake.tangents import vertex_normals
+from fd_mitsuba.export.final_surface.shading import smooth_normals
+from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.tessellate import unit_sphere
 
@@ -94,3 +97,32 @@ def test_what_does_not_touch_has_no_joint() -> None:
     vertices, faces, base = waved(0.0, 0)
     joint = measure_joint(vertices + [0, 0.5, 0], faces, base, CELL)
     assert joint.curves == 0 and joint.length == 0 and len(joint.turning_deg) == 0
+
+
+def test_noise_widens_a_mirror_as_much_as_its_slopes_are_spread() -> None:
+    """Two Gaussians one after the other: the variances of the slopes, alpha^2 / 2 an axis, are added."""
+    rng = np.random.default_rng(0)
+    roughness, slope = 0.1, 0.03
+    microfacets = rng.normal(scale=roughness**2 / np.sqrt(2), size=200_000) + rng.normal(scale=slope, size=200_000)
+    mean_angle = np.degrees(np.hypot(*rng.normal(scale=slope, size=(2, 200_000)))).mean()
+    widened = widened_roughness(np.array([roughness]), mean_angle)
+    assert widened[0] == pytest.approx((np.sqrt(2) * microfacets.std()) ** 0.5, rel=0.01)
+    assert widened_roughness(np.float32([[0.6]]), mean_angle)[0, 0] == pytest.approx(0.6, abs=0.003)
+    assert widened_roughness(np.array([0.2]), 0.0)[0] == pytest.approx(0.2)
+    assert widened_roughness(np.array([0.2]), 90.0)[0] == 1
+
+
+def test_smooth_normals_lose_noise_and_keep_edges() -> None:
+    vertices, faces = remeshed("cube")
+    normals = smooth_normals(vertices, faces, 2 / 50)
+    # Farther from an edge than a triangle is long, a face is flat.
+    flat = np.abs(vertices).max(axis=1) - np.sort(np.abs(vertices), axis=1)[:, 1] > 0.06
+    assert flat.sum() > 1000
+    straight = np.abs(normals[flat]).max(axis=1)
+    assert straight.min() > np.cos(np.radians(1))
+    rng = np.random.default_rng(0)
+    vertices, faces = unit_sphere(5)
+    rough = vertices * (1 + 0.002 * rng.normal(size=(len(vertices), 1)))
+    noisy, calm = vertex_normals(rough, faces), smooth_normals(rough, faces, 0.1)
+    off = [np.degrees(np.arccos(np.einsum("ij,ij->i", n, vertices).clip(-1, 1))).mean() for n in (noisy, calm)]
+    assert off[0] > 2 and off[1] < off[0] / 2

@@ -356,6 +356,8 @@ class OutputConfig(Section):
     """Pixels a side of the photographs of the finished object."""
     faces: Annotated[int, Field(ge=100, le=2_000_000), MAY_CHANGE] = 20_000
     """Triangles of each exported part, at most: a small one gets fewer."""
+    roughness_floor: Annotated[bool, MAY_CHANGE] = True
+    """Bake a roughness that hides the noise of the part's own shading: a near-mirror would show it as streaks."""
     texture_size: Annotated[int, Field(ge=16, le=8192), MAY_CHANGE] = 1024
     """Texels a side of each exported part's pictures."""
 

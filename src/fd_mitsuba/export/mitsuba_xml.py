@@ -22,6 +22,7 @@ from fd_mitsuba.scene.xml_element import XmlElement
 FILES = "files"
 """Folder beside the scene that holds what it reads."""
 
+_OPAQUE = ("principled", "diffuse", "conductor", "roughconductor", "plastic", "roughplastic")
 _WRAPPERS = ("twosided", "mask", "normalmap", "bumpmap")
 
 
@@ -167,17 +168,27 @@ def _part(part: MitsubaPart, bsdf: ET.Element) -> ET.Element:
             leaf.remove(old)
         leaf.append(_bitmap(parameter, picture, raw=not coloured))
     if part.normal_map:
+        # At the outline, bent normals look away from the camera, where Mitsuba shows black: a rim around every metal.
         bent = ET.Element("bsdf", {"type": "normalmap"})
+        _put(bent, "boolean", "use_shadowing_function", "false")
         bent.append(_bitmap("normalmap", part.normal_map, raw=True))
         # Inside a `twosided`, which Mitsuba wants outermost.
         if holder is None:
-            bsdf = bent
+            bsdf = ET.Element("bsdf", {"type": "twosided"}) if _is_opaque(leaf) else bent
+            if bsdf is not bent:
+                bsdf.append(bent)
         else:
             holder.remove(leaf)
             holder.append(bent)
         bent.append(leaf)
     shape.append(bsdf)
     return shape
+
+
+def _is_opaque(bsdf: ET.Element) -> bool:
+    """Whether a BSDF may have the same on its back, for certain."""
+    clear = any(child.get("name") == "spec_trans" for child in bsdf)
+    return bsdf.get("type") in _OPAQUE and not clear
 
 
 def _bitmap(name: str, picture: str, raw: bool) -> ET.Element:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.export.bake.bake import Field, bake
+from fd_mitsuba.export.bake.bake import Field, bake, bent_normals
+from fd_mitsuba.export.bake.shading_noise import surface_noise, widened_roughness
 from fd_mitsuba.export.bake.unwrap import UnwrappedMesh, unwrap
 from fd_mitsuba.export.material import PbrMaterial, pbr_material
 from fd_mitsuba.export.obj import ply_with_uv
@@ -78,6 +79,9 @@ def ready_part(
     say(f"baking the textures of {name}, {texture_size} x {texture_size}")
     canonical = replace(mesh, vertices=scene.frame.to_canonical(mesh.vertices))
     textures = bake(canonical, part.values, texture_size)
+    if config.output.roughness_floor:
+        noise = surface_noise(canonical.vertices, canonical.faces, bent_normals(canonical, part.values))
+        textures = replace(textures, roughness=widened_roughness(textures.roughness, noise))
     pictures = part_pictures(label, textures)
     fed = part_material(scene, config.appearance.fixed, config.appearance.normal_map)
     feeds = {}

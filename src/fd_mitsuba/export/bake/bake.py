@@ -118,6 +118,14 @@ def bake(
     return TextureSet(**pictures, covered=covered)
 
 
+def bent_normals(mesh: UnwrappedMesh, field: Field, frame: Frame = tangent_frame) -> np.ndarray:
+    """The shading normals (V, 3) at the vertices of a mesh in the canonical frame, bent as the field says."""
+    with torch.no_grad():
+        local = np.asarray(field(torch.from_numpy(mesh.vertices.astype(np.float32))).normal, dtype=np.float64)
+    tangent, bitangent = frame(mesh.normals)
+    return _unit(local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * mesh.normals)
+
+
 def fill_holes(pictures: list[np.ndarray], known: np.ndarray) -> None:
     """Give every texel that is not `known` (H, W) the value of the nearest one that is, in place."""
     if known.all() or not known.any():

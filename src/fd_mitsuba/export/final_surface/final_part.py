@@ -5,7 +5,7 @@ beyond that; what looked torn was the marching. Here the same solid is
 
 1. sampled on a lattice two to four times finer, around its surface only, and marched (`fine_lattice`);
 2. remeshed into triangles of one size, every vertex on the function's zero set (`remesh`, `projection`);
-3. given that function's gradient for its normals.
+3. given smooth normals that keep its edges (`shading`).
 
 The offsets of the grid's vertices are left out: they are noise a tenth of a cell high, and make the dents.
 """
@@ -24,6 +24,8 @@ from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
 from fd_mitsuba.export.final_surface.projection import project
 from fd_mitsuba.export.final_surface.remesh import remesh
+from fd_mitsuba.export.final_surface.shading import smooth_normals
+from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_pieces import fill_pockets, keep_large
 from fd_mitsuba.export.solid.part_solid import LatticePart, lattice_part, part_solid, part_surface
@@ -37,6 +39,7 @@ _SHORTEST_CELLS = 0.2
 """Shorter edges than this, in cells of the training, show nothing more: the field's own cells are twice a cell."""
 _TRIES = 3
 """Times that the edge is lengthened if there are still more faces than wanted."""
+_LEAST_ANGLE_DEG = 12.0
 _FILM_CELLS = 0.12
 """Where the fillet is lower over the base, in cells of the training, the solid dives under the base."""
 _MESHED = 0.9
@@ -49,8 +52,8 @@ class FinalPart:
 
     Attributes:
         solid: canonical frame.
-        normals: (V, 3) float64 unit, of the function's gradient.
-        distance: (V,) how far the vertices are from the zero set, canonical units.
+        normals: (V, 3) float64 unit, for shading.
+        distance: (V,) how far the vertices are from the zero set by the last projection, canonical units.
     """
 
     solid: Solid
@@ -107,13 +110,27 @@ def final_part(
             break
         edge *= 1.05 * math.sqrt(len(triangles) / faces)
         vertices, triangles = remesh(vertices, triangles, edge, onto, 3)
-    vertices, normals, distance = project(function.with_gradient, vertices, 0.5 * made.spacing, 12, 1e-4 * spacing)
+    near = vertices
+    vertices, _, distance = project(function.with_gradient, near, 0.5 * made.spacing, 12, 1e-4 * spacing)
+    vertices = _without_slivers(near, vertices, triangles)
     solid = Solid(vertices, triangles, islands, coarse.bridged)
     if not solid.manifold:
         say(f"part {name or 'part'}: its fine surface is no solid; the training's own is written instead")
         plain = part_solid(grown, name)
         return FinalPart(plain, vertex_normals(plain.vertices, plain.faces), np.zeros(len(plain.vertices)))
-    return FinalPart(solid, normals, distance)
+    return FinalPart(solid, smooth_normals(vertices, triangles, spacing), distance)
+
+
+def _without_slivers(before: np.ndarray, after: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """`after`, but where triangles have become slivers their corners are as `before`, which is nearly as exact."""
+    moved = after.copy()
+    for _ in range(_TRIES):
+        thin = smallest_angles(moved, triangles) < _LEAST_ANGLE_DEG
+        if not thin.any():
+            break
+        corners = np.unique(triangles[thin])
+        moved[corners] = before[corners]
+    return moved
 
 
 def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFunction:
