@@ -2,7 +2,7 @@
 
 A field on a hash grid is linear between the grid's points, so its gradient jumps where it passes from one cell to the
 next. On a mirror each jump is a torn reflection. The mesh's own normals have half of that noise; means over the
-triangles around, a fraction of a training cell wide, have a quarter.
+triangles around, a fraction of a training cell wide, have a third.
 """
 
 from __future__ import annotations
