@@ -30,6 +30,7 @@ from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import rgba_png
 from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.studio.base_glb import only_parts
 
 ROOT = Path(__file__).parents[2]
 ASSETS = ROOT / "tests" / "data" / "assets"
@@ -406,12 +407,18 @@ def test_a_picture_gets_its_opacity_as_alpha() -> None:
     assert (np.asarray(whole)[..., :3] == made.RED).all()
 
 
-def test_a_glb_is_in_metres_and_turns_parts_about_their_joint(load: Load, returned: Callable[..., Path]) -> None:
+def test_a_glb_is_in_metres_and_turns_parts_about_their_joint(
+    load: Load, returned: Callable[..., Path], tmp_path: Path
+) -> None:
     scene = load("figure.glb")
     assert scene.unit == "m"
     plain, small = read_asset(returned("figure.glb")), read_asset(returned("figure.glb", unit="cm", pivot=True))
     for one, other in zip(plain.meshes, small.meshes, strict=True):
         assert np.allclose(0.01 * one.placed()[0], other.placed()[0], atol=1e-7)
+    shown = only_parts(returned("figure.glb", unit="cm").read_bytes(), ["part"])  # as the studio shows it
+    (tmp_path / "shown.glb").write_bytes(shown)
+    (alone,) = read_asset(tmp_path / "shown.glb").meshes
+    assert np.allclose(alone.placed()[0], plain.meshes[-1].placed()[0], atol=1e-6)
     part = small.meshes[-1]
     centre = scene.frame.to_user(scene.regions[0].centre)
     pivot = part.to_asset[:3, 3] / 0.01
@@ -446,6 +453,11 @@ def test_what_is_printed_is_closed(load: Load, tmp_path: Path) -> None:
     scene = fd.load_scene(fd.import_asset(tmp_path / "hole.obj", tmp_path / "hole").scene)
     with pytest.raises(UserError, match="not closed .4 boundary edges.*assembled.ply"):
         export_assets(scene, RunConfig(), part, tmp_path / "out", ["print"], 64)
+
+
+def test_an_exported_glb_is_an_asset_whose_parts_are_base(returned: Callable[..., Path], tmp_path: Path) -> None:
+    scene = load_edit_scene(fd.import_asset(returned("figure.glb"), tmp_path / "again").scene)
+    assert {mesh.name for mesh in scene.base} == {"red", "gold", "base_part_part"} and not scene.earlier
 
 
 @needs_validator

@@ -24,7 +24,7 @@ SHEARED = np.array([[1.0, 0.8, 0, 0], [0, 1, 0, 4], [0.3, 0, 1, 0], [0, 0, 0, 1]
 MIRRORED = np.diag([-1.0, 1, 1, 1])
 
 
-def asset(several: bool = False) -> bytes:
+def asset(several: bool = False, metres: float | None = None) -> bytes:
     """A base, two shapes below one node if `several`, with places of their own, and a hat at (1, 2, 3)."""
     vertices, faces = unit_sphere(1)
     place = np.array([[0.0, 0, 1.5, 1], [0, 1.5, 0, 0], [-1.5, 0, 0, 0], [0, 0, 0, 1]])
@@ -34,7 +34,7 @@ def asset(several: bool = False) -> bytes:
         for i, name in enumerate(names)
     ]
     hat = GltfMesh("part_hat", 0.5 * vertices + [1, 2, 3], faces, PbrMaterial("part_hat"), extras={"part": "hat"})
-    return glb_bytes([*base, hat], {"prompt": "a ball with a hat"})
+    return glb_bytes([*base, hat], {"prompt": "a ball with a hat"}, metres)
 
 
 def world(data: bytes) -> dict[str, np.ndarray]:
@@ -64,6 +64,9 @@ def test_every_copy_is_where_its_matrix_says(several: bool) -> None:
         for count, place in enumerate(places[1:], 1):
             assert np.allclose(new[f"{name}_{count}"], trimesh.transform_points(old[name], place.to_world), atol=1e-5)
     assert len(new) == 3 + 2 * (2 if several else 1)
+    small = world(instance_glb(asset(several, 0.01), places))  # placements are in the scene's unit, the file in metres
+    assert small.keys() == new.keys()
+    assert all(np.allclose(small[name], 0.01 * new[name], atol=1e-6) for name in new)
     file = pygltflib.GLTF2.load_from_bytes(after)
     assert len(file.meshes) == len(old) and len(file.scenes[0].nodes) == 5
     assert len(after) - len(before) < 4000  # no vertex is there twice

@@ -81,7 +81,10 @@ def write_scene(
     ElementTree.SubElement(emitter, "float", name="scale", value="$light_scale")
     names: list[str] = [DEFAULT_PART_NAME, "light", *(region.name for region in regions)]
     for shape in shapes:
-        name = BASE_NAME if len(shapes) == 1 else safe_name(shape.name or BASE_NAME, names)
+        wanted = shape.name or BASE_NAME
+        if wanted.lower().startswith((f"{DEFAULT_PART_NAME}_", "cut_face_")):  # which names parts of earlier rounds
+            wanted = f"{BASE_NAME}_{wanted}"
+        name = BASE_NAME if len(shapes) == 1 else safe_name(wanted, names)
         names.append(name)
         root.append(_shape(shape, name, to_scene, add, notes))
     part = ElementTree.SubElement(root, "bsdf", type="principled", id=DEFAULT_PART_NAME)

@@ -91,12 +91,16 @@ METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0}
 """In a unit."""
 
 
+AS_IT_IS: Literal["as_it_is"] = "as_it_is"
+"""In place of a unit: whatever the scene says, its numbers are written as they are."""
+
+
 class GlbSettings(Section):
     """Of `glb`."""
 
-    unit: Unit | None = None
+    unit: Unit | Literal["as_it_is"] | None = None
     """What a unit of the scene is, since glTF has metres: a node `asset` above all others scales by it. Default: what
-    the scene's `dual_path` says in `unit`; without that, numbers are written as they are."""
+    the scene's `dual_path` says in `unit`; without that, and with `as_it_is`, numbers are written as they are."""
     pivot: bool = False
     """Whether a part's node lies where the part grows out of the base, so that it turns about its joint."""
 
@@ -109,6 +113,7 @@ class Glb(Exporter):
 
     def write(self, content: ExportContent) -> None:
         unit = self.settings.unit or content.scene.unit
+        unit = None if unit == AS_IT_IS else unit
         extras = content.extras if unit is None else {**content.extras, "unit": "metre"}
         meshes = _gltf_meshes(content, self.settings.pivot)
         content.write(self.leaves, glb_bytes(meshes, extras, None if unit is None else METRES[unit]))
