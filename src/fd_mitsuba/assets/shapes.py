@@ -58,7 +58,9 @@ def scene_shapes(asset: Asset, notes: list[str]) -> list[SceneShape]:
         mesh = meshes[0] if alone else _joined(meshes)
         name = mesh.name if len(groups) == 1 or number < 0 or not material.name else material.name
         if coloured:
-            mesh, material = _coloured(mesh, material if number >= 0 else replace(_PLAIN, base_color=(1, 1, 1)), notes)
+            mesh, material = _coloured(
+                mesh, material if number >= 0 else replace(_PLAIN, base_color=(1.0, 1.0, 1.0)), notes
+            )
         material, uv = _one_uv_set(mesh, material, notes)
         vertices, to_asset = mesh.vertices, mesh.to_asset
         if is_coarse(vertices):  # 32 bits are too few for where it lies, but not for its shape
