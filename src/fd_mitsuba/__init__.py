@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fd_mitsuba.api import Run, demo_scene, edit, evaluate, load_scene
+    from fd_mitsuba.api import Run, demo_scene, edit, evaluate, import_asset, load_scene
     from fd_mitsuba.config import RunConfig as Config
     from fd_mitsuba.config import Section
     from fd_mitsuba.config.choice import Choice

@@ -185,8 +185,8 @@ class _Reader:
         self.notes.append(f"mesh {name!r} is skinned, and is taken in its rest pose")
         moved = np.einsum("nij,nj->ni", blended[:, :3, :3], vertices) + blended[:, :3, 3]
         if normals is not None:
-            normals = np.einsum("nij,nj->ni", blended[:, :3, :3], normals)
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+            turned = np.einsum("nij,nj->ni", blended[:, :3, :3], normals)
+            normals = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
         return moved, normals
 
 

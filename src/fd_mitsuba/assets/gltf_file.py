@@ -6,7 +6,7 @@ import base64
 import binascii
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -186,7 +186,8 @@ class GltfFile:
 
     def _with_sparse(self, values: np.ndarray, sparse: dict[str, Any], width: int, dtype: np.dtype) -> np.ndarray:
         count, indices, changed = sparse.get("count"), sparse.get("indices"), sparse.get("values")
-        kind = _TYPES.get(indices.get("componentType", 0)) if isinstance(indices, dict) else None
+        indices = indices if isinstance(indices, dict) else {}
+        kind = _TYPES.get(indices.get("componentType", 0))
         if kind is None or not isinstance(changed, dict) or not _is_count(count) or count > len(values):
             raise BrokenAsset("has a sparse accessor that is not as glTF has it; export the model anew")
         place = self._rows(indices.get("bufferView"), indices.get("byteOffset", 0), count, 1, np.dtype(kind))[:, 0]
@@ -228,5 +229,5 @@ def _embedded(uri: str) -> bytes:
         raise BrokenAsset("has embedded data that is not base64; export the model anew") from None
 
 
-def _is_count(value: object) -> bool:
+def _is_count(value: object) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0

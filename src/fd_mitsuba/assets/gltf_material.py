@@ -38,7 +38,7 @@ def gltf_material(file: GltfFile, index: int, notes: list[str]) -> AssetMaterial
     mode = entry.get("alphaMode", "OPAQUE")
     material = AssetMaterial(
         name,
-        base_color=factor[:3],
+        base_color=(factor[0], factor[1], factor[2]),
         base_texture=base,
         roughness=_number(surface, "roughnessFactor", 1.0),
         roughness_texture=None if packed is None else replace(packed, channel=1),
@@ -70,7 +70,7 @@ def _extended(file: GltfFile, material: AssetMaterial, extensions: dict[str, Any
         base = _texture(file, glossy.get("diffuseTexture"))
         material = replace(
             material,
-            base_color=factor[:3],
+            base_color=(factor[0], factor[1], factor[2]),
             base_texture=base,
             opacity=factor[3],
             opacity_texture=None if base is None else replace(base, channel=3),
@@ -133,7 +133,8 @@ def _number(parent: dict[str, Any], key: str, default: float) -> float:
 
 def _numbers(parent: dict[str, Any], key: str, default: tuple[float, ...]) -> tuple[float, ...]:
     found = parent.get(key)
-    good = isinstance(found, list) and len(found) == len(default)
-    if not good or not all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in found):
+    if not isinstance(found, list) or len(found) != len(default):
+        return default
+    if not all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in found):
         return default
     return tuple(float(value) for value in found)

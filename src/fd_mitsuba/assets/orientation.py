@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from fd_mitsuba.errors import UserError
 
@@ -135,4 +135,4 @@ def _asymmetry(points: np.ndarray, axis: np.ndarray) -> float:
     """Mean distance between points and their mirror images about the middle of their box across a unit axis."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     mirrored = points - 2 * ((points - middle) @ axis)[:, None] * axis
-    return float(cKDTree(points).query(mirrored)[0].mean())
+    return float(KDTree(points).query(mirrored)[0].mean())

@@ -230,7 +230,8 @@ def region_size(text: str | None, longest_side: float) -> tuple[float, float, fl
         UserError: anything else, and sizes beyond 0.02 to 2 longest sides.
     """
     if text is None:
-        return (DEFAULT_SIZE * longest_side,) * 3
+        size = DEFAULT_SIZE * longest_side
+        return size, size, size
     values = []
     for word in text.split(","):
         found = re.fullmatch(r"\s*([\d.]+(?:[eE][-+]?\d+)?)\s*(%|u)?\s*", word)
@@ -248,7 +249,8 @@ def region_size(text: str | None, longest_side: float) -> tuple[float, float, fl
         values.append(value)
     if len(values) not in (1, 3):
         raise UserError(f"--size {text}: give one size, or three: width, height, depth")
-    return tuple(values * 3) if len(values) == 1 else tuple(values)  # type: ignore[return-value]
+    width, height, depth = values * 3 if len(values) == 1 else values
+    return width, height, depth
 
 
 def _upright(normal: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ def framed_camera(
     """
     points = np.asarray(points, dtype=np.float64)
     reach = np.tan(np.radians(fov_deg) / 2) * fill
-    target = (points.min(axis=0) + points.max(axis=0)) / 2
+    target, distance = (points.min(axis=0) + points.max(axis=0)) / 2, 0.0
     right, up, back = _axes(azimuth_deg, elevation_deg)
     for left in reversed(range(_ROUNDS)):
         offset = points - target
