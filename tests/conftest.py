@@ -26,6 +26,12 @@ REGION = """<shape type="focal_region" id="wing">
   </shape>"""
 
 
+def pytest_collection_finish() -> None:
+    """Spares later collections the modules and test items, which stay: each takes a fraction of a second otherwise."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session")
 def mi() -> Any:
     """Mitsuba with the default variant and the plugins of fd_mitsuba."""

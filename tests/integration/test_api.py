@@ -111,7 +111,7 @@ def test_what_is_not_there_is_named(edited: tuple[fd.Run, Darker, list], tmp_pat
 def test_quiet_is_silent(
     edited: tuple[fd.Run, Darker, list], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    settings = fd.Config.load("smoke", [*TINY, "geometry.steps=1"])
+    settings = fd.Config.load("smoke", [*TINY, "geometry.steps=1", "output.picture_size=0"])
     fd.edit(fd.load_scene(SCENE), settings, output=tmp_path / "run", guidance=Darker(), stages=["geometry"], quiet=True)
     assert capfd.readouterr() == ("", "")
 
@@ -123,7 +123,7 @@ def test_what_the_callback_raises_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="enough"):
         fd.edit(
             fd.load_scene(SCENE),
-            fd.Config.load("smoke", TINY),
+            fd.Config.load("smoke", [*TINY, "output.picture_size=0"]),
             output=tmp_path / "run",
             guidance=Darker(),
             on_step=stop,

@@ -19,7 +19,7 @@ Make = Callable[..., Path]
 TINY = [
     *("field.levels=2", "field.log2_table=8", "geometry.steps=4", "geometry.grid_resolution=16", "geometry.views=1"),
     *("geometry.spp=1", "geometry.lambda_sds=0", "output.turntable_frames=2", "output.turntable_size=16"),
-    "output.picture_size=16",
+    "output.picture_size=0",
 ]
 
 

@@ -21,7 +21,7 @@ SMALLER = [
     "appearance.steps=2",
     "output.turntable_frames=2",
     "output.turntable_size=32",
-    "output.picture_size=32",
+    "output.picture_size=0",
     "output.texture_size=64",
 ]
 

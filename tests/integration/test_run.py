@@ -50,7 +50,7 @@ sheet_every = 3
 checkpoint_every = 4
 turntable_frames = 3
 turntable_size = 32
-picture_size = 32
+picture_size = 0
 """
 )
 STEPS = 6

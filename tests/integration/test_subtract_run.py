@@ -34,7 +34,7 @@ SETTINGS = [
     "field.levels=3",
     "output.turntable_frames=2",
     "output.turntable_size=32",
-    "output.picture_size=32",
+    "output.picture_size=0",
 ]
 
 

@@ -267,7 +267,7 @@ def test_two_whole_rounds(first: Path, tmp_path: Path) -> None:
     """Both stages of both rounds, with no guidance and two steps each."""
     sizes = ["geometry.steps=2", "appearance.steps=2", "appearance.lambda_sds=0", "appearance.views=1"]
     sizes += ["appearance.spp=1", "appearance.picture_size=16", "output.texture_size=64"]
-    sizes += ["output.turntable_frames=2", "output.turntable_size=16", "output.picture_size=16"]
+    sizes += ["output.turntable_frames=2", "output.turntable_size=16", "output.picture_size=0"]
     settings = [word for item in SMALL + sizes for word in ("--set", item)]
     scenes = [first.parent / "scene.xml", tmp_path / "one" / "export" / "mitsuba" / "scene.xml"]
     more = ["--regions", str(regions(tmp_path)), "--prompt", PROMPT]

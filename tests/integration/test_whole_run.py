@@ -51,14 +51,15 @@ def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
     return root
 
 
-def run(place: Path, output: str, *more: str) -> int:
+def run(place: Path, output: str, *more: str, picture_size: int = 0) -> int:
     words = ["run", place / "scene.xml", "-c", place / "tiny.toml", "--set", f"guidance.model={place / 'sd15'}"]
+    words += ["--set", f"output.picture_size={picture_size}"]
     return main([str(word) for word in (*words, "-o", place / output, "-q", "-t", "2", *more)])
 
 
 @pytest.fixture(scope="module")
 def finished(place: Path) -> Path:
-    assert run(place, "run") == 0
+    assert run(place, "run", picture_size=32) == 0
     return place / "run"
 
 
@@ -154,7 +155,8 @@ def test_a_resume_takes_settings_that_change_no_result(
     copy = shutil.copytree(finished, place / "other_output")
     settings = ("output.turntable_frames=3", "output.texture_size=64", "guidance.views_per_call=1")
     capfd.readouterr()
-    assert run(place, "other_output", "--resume", *[word for item in settings for word in ("--set", item)]) == 0
+    words = [word for item in settings for word in ("--set", item)]
+    assert run(place, "other_output", "--resume", *words, picture_size=16) == 0
     error = capfd.readouterr().err
     assert "guidance.views_per_call = 1 (was 4)" in error and "output.turntable_frames = 3 (was 2)" in error
     assert len(imageio.imread(copy / "videos" / "appearance.mp4")) == 3
@@ -163,7 +165,8 @@ def test_a_resume_takes_settings_that_change_no_result(
     name = "checkpoints_appearance/step_000003.safetensors"
     assert (copy / name).read_bytes() == (finished / name).read_bytes()
     # And on from there with the settings as they are now.
-    assert run(place, "other_output", "--resume", *[word for item in settings for word in ("--set", item)]) == 0
+    words = [word for item in settings for word in ("--set", item)]
+    assert run(place, "other_output", "--resume", *words, picture_size=16) == 0
     assert "goes on with" not in capfd.readouterr().err
 
 

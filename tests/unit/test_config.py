@@ -225,7 +225,13 @@ def test_settings_that_may_change_on_the_way_are_marked_at_the_field() -> None:
         "guidance.device",
         "plugins",
     }
-    others = ["guidance.device=cuda:1", "guidance.views_per_call=1", *(f"{key}=170" for key in marked if "out" in key)]
+    switches = {"output.roughness_floor"}
+    others = [
+        "output.roughness_floor=false",
+        "guidance.device=cuda:1",
+        "guidance.views_per_call=1",
+        *(f"{key}=170" for key in marked - switches if "out" in key),
+    ]
     for stage in ("geometry", "appearance"):
         assert RunConfig.load(None, others).content_hash(stage) == RunConfig().content_hash(stage)
     # Everything else counts, each setting by itself.

@@ -352,8 +352,8 @@ class OutputConfig(Section):
     """Frames of a turntable."""
     turntable_size: Annotated[int, Field(ge=16, le=4096), MAY_CHANGE] = 256
     """Pixels a side of a turntable."""
-    picture_size: Annotated[int, Field(ge=16, le=2048), MAY_CHANGE] = 1024
-    """Pixels a side of the photographs of the finished object."""
+    picture_size: Annotated[int, Field(ge=0, le=2048), MAY_CHANGE] = 1024
+    """Pixels a side of the photographs of the finished object; 0: none, which saves their seconds."""
     faces: Annotated[int, Field(ge=100, le=2_000_000), MAY_CHANGE] = 20_000
     """Triangles of each exported part, at most: a small one gets fewer."""
     roughness_floor: Annotated[bool, MAY_CHANGE] = True

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fd_mitsuba.backend.file_threads import file_threads
+from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import colour_picture, grey_values, normal_picture, opacity_picture, orm_picture
 from fd_mitsuba.scene.bsdf_reading import COLOURS, read_material
@@ -134,8 +135,11 @@ def _means(file: SceneFile, element: SceneElement) -> dict[str, Any]:
     import drjit as dr
 
     mi, side = file.mi, 16
-    with file.searching(), file_threads():
-        bsdf = mi.load_dict(file.description(element), parallel=False)
+    try:
+        with file.searching(), file_threads():
+            bsdf = mi.load_dict(file.description(element), parallel=False)
+    except MITSUBA_ERRORS as error:  # a picture that was there when the scene was read
+        raise (fault_of_file(file, error) or file.translated(error)) from None
     interaction = dr.zeros(mi.SurfaceInteraction3f, side * side)
     index = dr.arange(mi.UInt32, side * side)
     interaction.uv = mi.Point2f((index % side + 0.5) / side, (index // side + 0.5) / side)

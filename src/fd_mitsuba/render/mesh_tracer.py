@@ -115,7 +115,19 @@ class MeshTracer:
             dr.eval(film, view)
             if dr.width(view) > _POINTS_PER_FACE * len(self._moving_mesh[1]):
                 return self.trace(cameras.at(view).ray(film), coherent=True)
-            # Drawn: without a hierarchy of the faces that change.
+        return self.draw(cameras, film, view, mesh, from_outside)
+
+    def draw(
+        self,
+        cameras: FilmCameras,
+        film: mi.Point2f,
+        view: mi.UInt32,
+        mesh: tuple[mi.Float, mi.UInt32],
+        from_outside: bool = False,
+    ) -> Hit:
+        """`see` without a hierarchy of the faces that change, of which there must be one at least."""
+        with dr.suspend_grad():
+            dr.eval(film, view)
             count = len(self._moving_mesh[1])
             points = sort_points(cameras, film, view)
             drawn = nearest_faces(points, cameras, *mesh, self._static_faces, count, front_only=from_outside)

@@ -48,8 +48,8 @@ def write_photographs(
     """
     if not has_denoiser():
         say(NO_DENOISER)
-    views = PhotoViews.of(scene, folder)
     size, turn_size = output.picture_size, min(output.picture_size, _TURN_SIZE)
+    views = PhotoViews.of(scene, folder, turn_size)
     frames = [
         views.shown(views.after.photograph(camera, turn_size, _TURN_SPP, seed=2, quick=True))
         for camera in views.around(output.turntable_frames)
@@ -85,8 +85,8 @@ class PhotoViews:
     whole: np.ndarray
 
     @classmethod
-    def of(cls, scene: EditScene, folder: Path) -> PhotoViews:
-        """Those of a run folder whose Mitsuba scene has been exported."""
+    def of(cls, scene: EditScene, folder: Path, size: int = _TURN_SIZE) -> PhotoViews:
+        """Those of a run folder whose Mitsuba scene has been exported; `size` is what `exposure` is found at."""
         away, frame, base = ("focal_region", "sensor", "integrator"), scene.render_frame, scene.base_canonical.vertices
         exported, original = SceneFile(folder / "export" / "mitsuba" / "scene.xml"), scene.inputs.scene
         loaded = exported.instantiate(without=away, origin=scene.origin)
@@ -102,7 +102,7 @@ class PhotoViews:
         before = PhotoSet.of(exported.mi, without, frame, ground)
         camera = _from_best_side(after, names, whole, _FILL)
         close = _from_best_side(after, names, parts, _CLOSE_FILL)
-        return cls(after, before, camera, close, after.exposure(camera), whole)
+        return cls(after, before, camera, close, after.exposure(camera, size), whole)
 
     def around(self, count: int) -> list[CameraBatch]:
         """`count` cameras around the object."""

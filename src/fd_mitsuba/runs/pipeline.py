@@ -191,7 +191,8 @@ def run(
         if with_assets:
             with rendering_threads():
                 write_assets(geometry, finished, field, folder, ("glb", "mitsuba"), config.output.texture_size, say)
-                write_photographs(scene, folder, config.output, say)
+                if config.output.picture_size:
+                    write_photographs(scene, folder, config.output, say)
         metrics["warnings"] = outcome_warnings(metrics)
         # Written last of all: a folder without it is not finished.
         done = {"geometry", *stages}

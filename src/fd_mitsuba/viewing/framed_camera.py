@@ -7,6 +7,8 @@ import numpy as np
 from fd_mitsuba.scene.views import CameraBatch
 
 _ROUNDS = 4
+_OFF_AXIS_DEG = 0.1
+"""Cameras along an axis would have zeros in their matrices, for which a renderer compiles kernels of their own."""
 
 
 def framed_camera(
@@ -37,14 +39,14 @@ def framed_camera(
 def turned_cameras(
     points: np.ndarray, count: int, elevation_deg: float, fov_deg: float, fill: float
 ) -> list[CameraBatch]:
-    """`count` cameras around the vertical axis through the points' middle, all from one distance, front first.
+    """`count` cameras around the vertical axis through the points' middle, all from one distance, the front first.
 
     Each sees every point, so the frames of a film of them have one scale.
     """
     points = np.asarray(points, dtype=np.float64)
     target = (points.min(axis=0) + points.max(axis=0)) / 2
     reach, distance = np.tan(np.radians(fov_deg) / 2) * fill, 0.0
-    azimuths = np.arange(count) * (360.0 / count)
+    azimuths = _OFF_AXIS_DEG + np.arange(count) * (360.0 / count)
     for azimuth in azimuths:
         right, up, back = _axes(azimuth, elevation_deg)
         offset = points - target

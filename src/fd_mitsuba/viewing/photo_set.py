@@ -29,6 +29,8 @@ _BALANCE = 0.8
 """How much of the light's tint is taken out: with all of it, an evening would be noon; without, gold in blue light is
 green."""
 _LIT = 0.7
+_METERED_SIZE, _METERED_SAMPLES = 64, 1 << 19
+"""The image that the exposure is found in has about so many pixels a side, and at least so many samples in all."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -104,12 +106,17 @@ class PhotoSet:
         seen = np.array(self.mi.render(self.scene, sensor=sensor, integrator=aovs, spp=_GUIDE_SPP, seed=seed))
         return np.clip(seen[..., :3], 0, 1), seen[..., 3:6]
 
-    def exposure(self, camera: CameraBatch, size: int = 64, spp: int = 64) -> np.ndarray:
+    def exposure(self, camera: CameraBatch, size: int) -> np.ndarray:
         """What to multiply linear RGB with (3,): it shows the ground as paper, and takes most of the light's tint out.
 
         As a photographer does with a grey card. 1 where no light reaches the ground.
+
+        Args:
+            size: of an image that is taken anyway: each size is a kernel of its own, which takes seconds to compile.
         """
-        image, (albedo, normal) = self.radiance(camera, size, spp), self.guides(camera, size)
+        spp = max(1, 1 << (_METERED_SAMPLES // size**2).bit_length() - 1)
+        seen = self.radiance(camera, size, spp), *self.guides(camera, size)
+        image, albedo, normal = (_coarser(values, max(1, size // _METERED_SIZE)) for values in seen)
         values = image[_is_ground(albedo, normal)].astype(np.float64)
         values = values[values @ _LUMINANCE > 0]
         if not len(values):
@@ -165,6 +172,12 @@ class PhotoSet:
                 "sampler": {"type": "independent"},
             }
         )
+
+
+def _coarser(values: np.ndarray, factor: int) -> np.ndarray:
+    """Means (H // factor, W // factor, 3) of squares of an image (H, W, 3)."""
+    side = len(values) // factor
+    return values[: side * factor, : side * factor].reshape(side, factor, side, factor, -1).mean(axis=(1, 3))
 
 
 def _is_ground(albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
