@@ -13,6 +13,7 @@ from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import colour_picture, grey_values, normal_picture, opacity_picture, orm_picture
 from fd_mitsuba.scene.bsdf_reading import COLOURS, read_material
+from fd_mitsuba.scene.file_faults import fault_of_file
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 
 AlphaMode = Literal["OPAQUE", "MASK", "BLEND"]
