@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
 from torch.nn.functional import avg_pool2d
 
-from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER
+from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER, builtin_folder
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.prior.data import captions as coarse_captions
 from fd_mitsuba.prior.data.body import Body
+from fd_mitsuba.prior.data.catalogue import FINE
 from fd_mitsuba.prior.data.fine.bodies import BODIES, NAMELESS
 from fd_mitsuba.prior.data.fine.captions import BODY_WORDS, NEUTRAL, PART_WORDS, bare, caption, vocabulary, word_lists
 from fd_mitsuba.prior.data.fine.looks import NATURAL, zone_of_piece
@@ -205,3 +208,10 @@ def test_every_zone_of_a_part_has_a_material(part: str) -> None:
     faces = np.cumsum([0] + [len(solid.faces) for solid in zones.values()])
     for zone in range(len(zones)):
         assert set(numbers[pieces[faces[zone] : faces[zone + 1]]]) == {zone}
+
+
+def test_the_shipped_weights_are_whole_and_know_the_words() -> None:
+    folder = builtin_folder(BUILTIN_FOLDER.with_name("shapes_fine"))
+    conventions = json.loads((folder / "fd_mitsuba.json").read_text(encoding="utf-8"))
+    assert conventions["vocabulary"] == FINE.word_lists
+    assert json.loads((folder / "unet" / "config.json").read_text(encoding="utf-8"))["sample_size"] == 128
