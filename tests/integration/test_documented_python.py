@@ -64,6 +64,7 @@ def test_the_blocks_of_the_python_page_run_in_order(tiny_quick: Path, monkeypatc
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_notebook_runs(path: Path, tiny_quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from nbclient import NotebookClient

@@ -144,6 +144,7 @@ def test_an_edit_from_python(edited: tuple[fd.Run, EditScene], mine: None) -> No
     assert volume == pytest.approx(run.part().volume, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_edit_from_the_command_line(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own, which finds the module by --plugin alone."""
     monkeypatch.chdir(place)

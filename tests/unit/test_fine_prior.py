@@ -90,15 +90,17 @@ def test_pairs_follow_from_the_seed() -> None:
     assert not np.array_equal(first[0].edited, other[0].edited)
 
 
-def drawn(count: int, seed: int = 0) -> list[FinePair]:
-    random, pairs = np.random.default_rng(seed), []
-    while len(pairs) < count:
+@pytest.fixture(scope="module")
+def drawn() -> list[FinePair]:
+    """400 pairs, as a training draws them."""
+    random, pairs = np.random.default_rng(0), []
+    while len(pairs) < 400:
         pairs += draw_pairs(GEOMETRY_FINE, random)
     return pairs  # type: ignore[return-value]
 
 
-def test_a_part_adds_to_the_picture_and_a_removal_takes_from_it() -> None:
-    pairs = [pair for pair in drawn(400) if pair.part and not pair.beside]
+def test_a_part_adds_to_the_picture_and_a_removal_takes_from_it(drawn: list[FinePair]) -> None:
+    pairs = [pair for pair in drawn if pair.part and not pair.beside]
     removed = [pair for pair in pairs if pair.removed]
     assert 0.04 < len(removed) / len(pairs) < 0.17
     for pair in pairs:
@@ -107,11 +109,11 @@ def test_a_part_adds_to_the_picture_and_a_removal_takes_from_it() -> None:
         assert not (less & ~more).any(), "a part covers, it never uncovers"
         says_so = " without " in pair.caption or " with no " in pair.caption
         assert says_so == pair.removed, pair.caption
-    assert any(pair.beside for pair in drawn(60))
+    assert any(pair.beside for pair in drawn)
 
 
-def test_training_never_shows_what_is_kept_for_the_evaluation() -> None:
-    shown = {(pair.body, pair.part) for pair in drawn(300)}
+def test_training_never_shows_what_is_kept_for_the_evaluation(drawn: list[FinePair]) -> None:
+    shown = {(pair.body, pair.part) for pair in drawn}
     assert not shown & GEOMETRY_FINE.catalogue.held_out
     assert all(part is None or suits(body, part) for body, part in shown)
 
@@ -171,12 +173,12 @@ def test_a_hats_brim_lies_outside_the_head() -> None:
         assert np.isfinite(distance).mean() < 0.05, "above the brim there is no more of the body"
 
 
-def test_the_finer_network_starts_with_what_the_coarse_one_knows() -> None:
+def test_the_finer_network_starts_with_what_the_coarse_one_knows(drawn: list[FinePair]) -> None:
     kind, tokenizer = GEOMETRY_FINE, build_tokenizer(GEOMETRY_FINE.catalogue.vocabulary)
     torch.manual_seed(0)
     modules = kind.build_modules(tokenizer)
     load_start(BUILTIN_FOLDER, modules, tokenizer, kind.prediction)
-    pairs = [p for p in drawn(60) if p.part in GEOMETRY.catalogue.part_weights and not p.removed and not p.beside][:8]
+    pairs = [p for p in drawn[:60] if p.part in GEOMETRY.catalogue.part_weights and not p.removed and not p.beside][:8]
     base, edited = (
         torch.from_numpy(np.stack([getattr(pair, name) for pair in pairs])).float() / 127 for name in ("base", "edited")
     )
