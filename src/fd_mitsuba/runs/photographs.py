@@ -29,8 +29,8 @@ _AZIMUTHS_DEG = (30.0, -30.0, 150.0, 210.0)
 _CLEARLY_MORE = 1.5
 """How many times as much of the part another side must show to be taken in place of the first."""
 _GROWN = ("part_", "cut_face_")
-_SPP, _TURN_SPP = 4, 2
-_TURN_SIZE = 512
+_SPP, _TURN_SPP = 4, 1
+_TURN_SIZE = 400
 _FILL, _CLOSE_FILL, _TURN_FILL = 0.82, 0.72, 0.92
 
 
