@@ -266,7 +266,7 @@ class GuidanceConfig(Section):
     words: tuple[ModelName, ...] = ()
     """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
     image_prompt: ModelName = ""
-    """A picture that the material shall be like, beside the prompt; appearance stage, through an IP-Adapter."""
+    """A picture that the material is to resemble, beside the prompt; appearance stage, through an IP-Adapter."""
     ip_adapter: ModelName = ""
     """The IP-Adapter's .safetensors file, or a folder with one; a plain one for the model."""
     ip_adapter_encoder: ModelName = ""

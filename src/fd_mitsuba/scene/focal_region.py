@@ -20,7 +20,7 @@ _SURFACE_POINTS = 4096
 
 @dataclass(frozen=True)
 class PartPrompt:
-    """What one part shall be.
+    """What one part is to become.
 
     Attributes:
         prompt: never blank.

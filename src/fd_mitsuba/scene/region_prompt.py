@@ -1,4 +1,4 @@
-"""The prompt of a focal region: what its own part shall be, where the scene's prompt speaks of several."""
+"""The prompt of a focal region: what its own part is to be, where the scene's prompt speaks of several."""
 
 from __future__ import annotations
 
