@@ -33,8 +33,8 @@ from PIL import Image  # noqa: E402
 
 from fd_mitsuba.evaluation.atlas_faults import foreign_colour, seam_jumps  # noqa: E402
 from fd_mitsuba.evaluation.base_drift import export_drift  # noqa: E402
-from fd_mitsuba.export.pictures import srgb_from_linear  # noqa: E402
 from fd_mitsuba.export.solid.solid import Solid  # noqa: E402
+from fd_mitsuba.io.srgb import srgb_from_linear  # noqa: E402
 from fd_mitsuba.runs.appearance_outcome import finished_appearance  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402

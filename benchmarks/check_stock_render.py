@@ -35,7 +35,7 @@ from PIL import Image  # noqa: E402
 from torch.nn.functional import avg_pool2d  # noqa: E402
 
 from fd_mitsuba.backend.file_threads import file_threads  # noqa: E402
-from fd_mitsuba.export.pictures import srgb_from_linear  # noqa: E402
+from fd_mitsuba.io.srgb import srgb_from_linear  # noqa: E402
 from fd_mitsuba.runs.appearance_outcome import finished_appearance  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.scene_file import ready_mitsuba  # noqa: E402

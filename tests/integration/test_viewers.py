@@ -19,7 +19,7 @@ from test_export_assets import Learned, exported, textured_base  # noqa: F401
 from viewer_setup import VIEWERS, needs_blender, needs_browser
 
 from fd_mitsuba.backend.file_threads import file_threads
-from fd_mitsuba.export.pictures import srgb_from_linear
+from fd_mitsuba.io.srgb import srgb_from_linear
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 
 Make = Callable[..., Path]

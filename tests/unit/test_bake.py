@@ -15,8 +15,9 @@ from fd_mitsuba.evaluation.atlas_faults import seam_jumps
 from fd_mitsuba.export.bake.bake import TextureSet, bake, fill_holes
 from fd_mitsuba.export.bake.tangents import vertex_tangents
 from fd_mitsuba.export.bake.unwrap import UnwrappedMesh, unwrap
-from fd_mitsuba.export.pictures import part_pictures, srgb_from_linear
+from fd_mitsuba.export.pictures import part_pictures
 from fd_mitsuba.fields.tangent_frame import tangent_frame
+from fd_mitsuba.io.srgb import srgb_from_linear
 
 SIZE = 512
 

@@ -14,7 +14,7 @@ from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
-from fd_mitsuba.export.pictures import srgb_from_linear
+from fd_mitsuba.io.srgb import srgb_from_linear
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene

@@ -56,10 +56,11 @@ def ball() -> PhotoSet:
     return PhotoSet.of(mi, scene, Normalisation(np.zeros(3), 1.0), 0.0)
 
 
-def test_the_ground_is_exposed_as_paper_and_less_tinted_than_the_light(ball: PhotoSet) -> None:
+@pytest.mark.parametrize("size", [128, 800])
+def test_the_ground_is_exposed_as_paper_and_less_tinted_than_the_light(ball: PhotoSet, size: int) -> None:
     """A plane under an even sky sends its reflectance times the sky's radiance."""
     camera = framed_camera(np.array([[-1.0, 0, -1], [1, 0, 1]]), 30.0, 20.0, 25.0)
-    exposure = ball.exposure(camera, 128)
+    exposure = ball.exposure(camera, size)
     shown = 0.6 * SKY * exposure
     assert shown @ [0.2126, 0.7152, 0.0722] == pytest.approx(0.8, rel=0.02)
     assert shown[2] / shown[0] == pytest.approx(4**0.2, rel=0.05)

@@ -204,8 +204,8 @@ def test_edit_again_needs_a_result(session: Session) -> None:
 
 
 def test_no_path_of_the_disk_is_shown(session: Session, tmp_path: Path) -> None:
-    line = f"{tmp_path}/my work/scene.xml:3: <shape>: {tmp_path}/work/scene/a.ply is gone, see https://x.org/a/b"
-    shown = without_paths(line, tmp_path / "my work")
+    line = f"{tmp_path}/my files/scene.xml:3: <shape>: {tmp_path}/files/scene/a.ply is gone, see https://x.org/a/b"
+    shown = without_paths(line, tmp_path / "my files")
     assert shown == "scene.xml:3: <shape>: a.ply is gone, see https://x.org/a/b"
     session.set_prompt("a pig with a submarine")
     report = session.check_now()

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from fd_mitsuba.assets.asset import AssetMaterial, Texture, TextureImage
-from fd_mitsuba.assets.colour_spaces import linear_from_srgb, srgb_from_linear
 from fd_mitsuba.assets.images import pixels, png_bytes
+from fd_mitsuba.io.srgb import linear_from_srgb, srgb_from_linear
 
 AddImage = Callable[[str, bytes, str], str]
 """Takes a name, the bytes and the suffix of an image, and gives the name of its file in the scene's folder."""

@@ -8,11 +8,11 @@ import numpy as np
 
 from fd_mitsuba.assets.asset import MOST_FACES, Asset, AssetMaterial
 from fd_mitsuba.assets.broken import BrokenAsset
-from fd_mitsuba.assets.colour_spaces import linear_from_srgb
 from fd_mitsuba.assets.corners import Corners
 from fd_mitsuba.assets.images import beside
 from fd_mitsuba.assets.mtl import read_mtl
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
+from fd_mitsuba.io.srgb import linear_from_srgb
 
 _MOST_BYTES = 1 << 32
 _REMEDY = "save the mesh anew"

@@ -11,9 +11,9 @@ import trimesh
 
 from fd_mitsuba.assets.asset import MOST_FACES, Asset, AssetMesh
 from fd_mitsuba.assets.broken import BrokenAsset
-from fd_mitsuba.assets.colour_spaces import linear_from_srgb
 from fd_mitsuba.assets.corners import Corners
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
+from fd_mitsuba.io.srgb import linear_from_srgb
 
 _MOST_BYTES = 1 << 32
 _TOO_MANY = f"has more than {MOST_FACES // 1_000_000} million faces; decimate it to a tenth"

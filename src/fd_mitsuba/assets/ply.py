@@ -8,10 +8,10 @@ import numpy as np
 
 from fd_mitsuba.assets.asset import MOST_FACES, Asset, AssetMaterial, Texture
 from fd_mitsuba.assets.broken import BrokenAsset
-from fd_mitsuba.assets.colour_spaces import linear_from_srgb
 from fd_mitsuba.assets.corners import Corners
 from fd_mitsuba.assets.images import beside, read_image
 from fd_mitsuba.assets.ply_rows import PlyElement, read_ply_rows
+from fd_mitsuba.io.srgb import linear_from_srgb
 
 _INDICES = ("vertex_indices", "vertex_index")
 _UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from fd_mitsuba.export.pictures import srgb_from_linear
+from fd_mitsuba.io.srgb import linear_from_srgb, srgb_from_linear
 
 _ALONG = np.linspace(0.05, 0.95, 7)
 _AROUND = 12
@@ -121,7 +121,7 @@ def filtered(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def mip_level(picture: np.ndarray, level: int) -> np.ndarray:
     """A colour picture (S, S, 3) in sRGB, 0 to 255, halved `level` times, S a multiple of 2 to that power."""
     share = np.asarray(picture, dtype=np.float64) / 255
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    linear = linear_from_srgb(share)
     for _ in range(level):
         linear = (linear[0::2, 0::2] + linear[1::2, 0::2] + linear[0::2, 1::2] + linear[1::2, 1::2]) / 4
     return srgb_from_linear(linear) * 255

@@ -9,9 +9,10 @@ from PIL import Image
 
 from fd_mitsuba.export.export_mesh import ExportMesh
 from fd_mitsuba.export.material import PbrMaterial
-from fd_mitsuba.export.pictures import Picture, srgb_from_linear
+from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.io.float_steps import is_coarse
 from fd_mitsuba.io.safe_text import safe_name
+from fd_mitsuba.io.srgb import srgb_from_linear
 
 
 class ObjMesh(ExportMesh):

@@ -11,6 +11,7 @@ from PIL import Image
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.export.bake.bake import TextureSet
+from fd_mitsuba.io.srgb import srgb_from_linear
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,6 @@ class Picture:
         if image.mode not in ("RGBA", "LA"):
             return None
         return np.asarray(image.getchannel("A"))
-
-
-def srgb_from_linear(values: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] of linear values, clipped."""
-    values = np.clip(values, 0.0, 1.0)
-    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
 def png(values: np.ndarray) -> bytes:

@@ -11,7 +11,8 @@ from PIL import Image
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.export.pictures import Picture, packed_orm, png, srgb_from_linear
+from fd_mitsuba.export.pictures import Picture, packed_orm, png
+from fd_mitsuba.io.srgb import srgb_from_linear
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 
 _SUFFIXES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}

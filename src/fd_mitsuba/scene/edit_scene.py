@@ -99,7 +99,7 @@ class EditScene:
 
     @cached_property
     def has_headroom(self) -> bool:
-        """Whether the canonical frame is another than the paper's, so that it holds the regions."""
+        """Whether the canonical frame differs from the paper's, so that it holds the regions."""
         soup = self.base_soup
         paper = Normalisation.of_points(soup.vertices[np.unique(soup.faces)])
         return paper.scale != self.frame.scale or not np.array_equal(paper.centre, self.frame.centre)

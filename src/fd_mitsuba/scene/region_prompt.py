@@ -18,7 +18,7 @@ def region_prompt(element: SceneElement) -> PartPrompt | None:
     texts = {name: " ".join(str(value).split()) for name, value in given.items()}
     for name, text in texts.items():
         if not text:
-            raise element.error(f"{name} is blank; write what the part shall be, or remove it")
+            raise element.error(f"{name} is blank; write what the part is to be, or remove it")
     if not texts:
         return None
     if PROMPT not in texts:

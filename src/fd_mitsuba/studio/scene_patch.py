@@ -33,7 +33,7 @@ def patched(
     Args:
         data: the file.
         name: of the file, for messages.
-        regions: the ellipsoids that shall be there; those of the file that are not among them, by name, go.
+        regions: the ellipsoids to be there; those of the file that are not among them, by name, go.
         before: the ellipsoids as the file has them: one that is equal stays as it is written.
         kept: names of regions that stay whatever they are, such as meshes.
         prompt: None: stays.

@@ -142,7 +142,7 @@ class View:
 
     def _pick(self, event: Any) -> None:
         self.canvas.picking(True)
-        self._note(event, "click on the base where the region shall be")
+        self._note(event, "click on the base to put the region there")
 
     def _clicked_region(self, name: str) -> None:
         self.session.select(name)

@@ -114,7 +114,8 @@ class PhotoSet:
         Args:
             size: of an image that is taken anyway: each size is a kernel of its own, which takes seconds to compile.
         """
-        spp = max(1, 1 << (_METERED_SAMPLES // size**2).bit_length() - 1)
+        # A power of two, as the photographs' own: others compile a kernel of their own too.
+        spp = 1 << max(1, _METERED_SAMPLES // size**2).bit_length() - 1
         seen = self.radiance(camera, size, spp), *self.guides(camera, size)
         image, albedo, normal = (_coarser(values, max(1, size // _METERED_SIZE)) for values in seen)
         values = image[_is_ground(albedo, normal)].astype(np.float64)
