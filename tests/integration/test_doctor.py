@@ -58,3 +58,13 @@ def test_whatever_fails_becomes_one_line(monkeypatch: pytest.MonkeyPatch, error:
     findings = {finding.name: finding for finding in doctor.examine()}
     assert not findings["torch"].ok and "\n" not in findings["torch"].text and findings["torch"].text
     assert findings["mitsuba"].ok
+
+
+def test_a_reader_that_has_gone_is_no_error_of_ours() -> None:
+    words = [sys.executable, "-m", "fd_mitsuba", "names"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    reading, writing = os.pipe()
+    process = subprocess.Popen(words, env=environment, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    os.close(reading)
+    assert process.communicate(timeout=100) == (None, "") and process.returncode == 1

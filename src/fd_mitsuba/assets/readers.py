@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fd_mitsuba.assets.asset import Asset
-from fd_mitsuba.assets.broken import BrokenAsset
-from fd_mitsuba.assets.gltf import read_gltf
-from fd_mitsuba.assets.obj import read_obj
-from fd_mitsuba.assets.plain_meshes import read_off, read_stl
-from fd_mitsuba.assets.ply import read_ply_asset
 from fd_mitsuba.errors import UserError, first_line
 
+if TYPE_CHECKING:
+    from fd_mitsuba.assets.asset import Asset
+
+
+def _reader(module: str, name: str) -> Callable[[Path], Asset]:
+    """That function of a module of this package, loaded at its first call: every command asks what is an asset."""
+
+    def read(path: Path) -> Asset:
+        return getattr(import_module(f"fd_mitsuba.assets.{module}"), name)(path)
+
+    return read
+
+
 READERS: dict[str, Callable[[Path], Asset]] = {
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".obj": read_obj,
-    ".ply": read_ply_asset,
-    ".stl": read_stl,
-    ".off": read_off,
+    ".glb": _reader("gltf", "read_gltf"),
+    ".gltf": _reader("gltf", "read_gltf"),
+    ".obj": _reader("obj", "read_obj"),
+    ".ply": _reader("ply", "read_ply_asset"),
+    ".stl": _reader("plain_meshes", "read_stl"),
+    ".off": _reader("plain_meshes", "read_off"),
 }
 """Suffix -> reader."""
 
@@ -35,6 +44,8 @@ def read_asset(path: Path) -> Asset:
     Raises:
         UserError: an unknown format, or whatever keeps it from being read, in one line that names the file.
     """
+    from fd_mitsuba.assets.broken import BrokenAsset
+
     suffix = path.suffix.lower()
     if suffix not in READERS:
         known = ", ".join(name.removeprefix(".").upper() for name in READERS)

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from fd_mitsuba.assets.readers import READERS
+from fd_mitsuba.assets.readers import is_asset
 from fd_mitsuba.cli.options import definitions, given_text, remark
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object, write_json
@@ -20,11 +20,6 @@ def scene_label(scene: str) -> str:
     """What a scene is called in names of folders: that of its own folder, or of a mesh file."""
     path = Path(scene)
     return path.stem if is_asset(scene) else path.resolve().parent.name
-
-
-def is_asset(scene: str) -> bool:
-    """Whether the argument names a mesh file and no scene."""
-    return Path(scene).suffix.lower() in READERS
 
 
 def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callable[[str], None] = remark) -> None:

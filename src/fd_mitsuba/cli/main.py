@@ -71,6 +71,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(_interrupted(options), file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read the output has gone, as `head` does: nobody is left to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except OSError as error:
         if verbose:
             raise

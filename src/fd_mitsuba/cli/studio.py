@@ -7,7 +7,8 @@ import signal
 import threading
 from pathlib import Path
 
-from fd_mitsuba.cli.given_scene import is_asset, prepare_scene, scene_label
+from fd_mitsuba.assets.readers import is_asset
+from fd_mitsuba.cli.given_scene import prepare_scene, scene_label
 from fd_mitsuba.cli.options import definitions, given_text, machine_options, remark, say, start
 from fd_mitsuba.cli.scene_options import axis_options, placing_options, settings_options
 from fd_mitsuba.errors import UserError
