@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT
+from fd_mitsuba.backend.threads import own_threads
 from fd_mitsuba.config import ChosenSettings, RunConfig, misfits, settings_for_run
 from fd_mitsuba.config.registry import load_plugins
 from fd_mitsuba.conventions import STAGES
@@ -116,8 +117,7 @@ def load_scene(
         prompt: in place of the scene's.
         regions: an XML file with focal regions, such as for a scene that was exported.
         threads: cores to use; 0: all; 1: results that are the same bytes at every run. Import torch after this call.
-            With 1, and with 0 on two cores, Dr.Jit keeps a single thread, and Mitsuba 3.9 then waits forever when your
-            own code reads or writes an EXR: do that within `fd_mitsuba.backend.file_threads.file_threads()`.
+            Between calls of this package your own code has its threads back.
         variant: Mitsuba's.
         on_misplaced: takes what is wrong with the place of a region, which is then kept; None: it is raised.
         plugins: modules or .py files to import first, which register what the scene names; see docs/extending.md.
@@ -130,22 +130,20 @@ def load_scene(
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
     """
-    from fd_mitsuba.backend.threads import share_cores
-
     words = None if prompt is None else " ".join(prompt.split())
     if words == "":
         raise UserError("prompt: is blank; describe the edited object")
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
-    share_cores(threads, variant)
-    load_plugins(plugins)
-    from fd_mitsuba.scene.edit_scene import load_edit_scene
+    with own_threads(threads, variant):
+        load_plugins(plugins)
+        from fd_mitsuba.scene.edit_scene import load_edit_scene
 
-    if at:
-        regions = _placed(Path(path), dict(parameters or {}), regions, at, size)
-    elif size is not None:
-        raise UserError(f"size {size}: is that of regions to place; say where they go, too")
-    return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced, needs_region)
+        if at:
+            regions = _placed(Path(path), dict(parameters or {}), regions, at, size)
+        elif size is not None:
+            raise UserError(f"size {size}: is that of regions to place; say where they go, too")
+        return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced, needs_region)
 
 
 def _placed(
@@ -168,6 +166,7 @@ def temporary_folder() -> Path:
     return folder
 
 
+@own_threads()
 def edit(
     scene: EditScene | Path | str,
     config: RunConfig | ChosenSettings | None = None,
@@ -253,6 +252,7 @@ def edit(
     return result
 
 
+@own_threads()
 def evaluate(run: Run | Path | str, *, judge: str | None = None, **protocol: Any) -> dict[str, Any]:
     """The metrics of a finished run: CLIP scores, base preservation, leakage; also written to `evaluation.json`.
 
@@ -263,9 +263,6 @@ def evaluate(run: Run | Path | str, *, judge: str | None = None, **protocol: Any
     Raises:
         UserError: no finished run there, a model that cannot be loaded.
     """
-    from fd_mitsuba.backend.threads import share_cores_once
-
-    share_cores_once()
     from fd_mitsuba.evaluation.clip import ClipJudge
     from fd_mitsuba.evaluation.run_evaluation import Protocol, evaluate_run
 

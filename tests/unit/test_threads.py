@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import drjit as dr
 import pytest
@@ -43,6 +44,7 @@ def test_the_renderer_shares_only_where_there_are_cores_to_spare() -> None:
 def test_a_process_starts_with_the_shares(given: int, network: int, renderer: int) -> None:
     script = f"""
 import sys
+from pathlib import Path
 from fd_mitsuba.backend.threads import network_threads, share_cores
 assert "torch" not in sys.modules
 share_cores({given})
@@ -67,3 +69,25 @@ def test_lone_threads_stay_alone_when_another_thread_takes_more() -> None:
             assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)
+
+
+def test_code_between_our_calls_has_its_own_threads(tmp_path: Path) -> None:
+    """Mitsuba waits forever for an EXR with one thread of Dr.Jit's, which is what a run takes on two cores."""
+    script = f"""
+import numpy as np
+from fd_mitsuba.backend.threads import own_threads
+counts = []
+with own_threads(1):
+    import drjit as dr, mitsuba as mi, torch
+    counts += [dr.thread_count(), torch.get_num_threads()]
+mi.Bitmap(np.full((64, 64, 3), 0.5, np.float32)).write({str(tmp_path / "a.exr")!r})
+dr.set_thread_count(3)
+torch.set_num_threads(4)
+with own_threads():
+    counts += [dr.thread_count(), torch.get_num_threads()]
+counts += [dr.thread_count(), torch.get_num_threads()]
+print(*counts, float(np.array(mi.Bitmap({str(tmp_path / "a.exr")!r})).max()))
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["1", "1", "1", "1", "3", "4", "0.5"], done.stderr

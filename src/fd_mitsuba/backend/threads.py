@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -57,10 +58,28 @@ def share_cores(threads: int = 0, variant: str = DEFAULT_VARIANT) -> None:
     _keep_freed_memory()
 
 
-def share_cores_once() -> None:
-    """`share_cores` with all cores, unless it was called before."""
-    if _cores is None:
-        share_cores()
+@contextmanager
+def own_threads(threads: int | None = None, variant: str = DEFAULT_VARIANT) -> Iterator[None]:
+    """While open, thread counts are as `share_cores` sets them; then they are the caller's again.
+
+    For functions that other people's code calls. That code may render and read files by itself, and with a single
+    thread of Dr.Jit's, as two cores have it in a run, Mitsuba 3.9 waits forever when it reads or writes an EXR.
+
+    Args:
+        threads: as of `share_cores`; None: those of the call before, at first all cores.
+
+    Raises:
+        UserError: as `share_cores`.
+    """
+    before = _thread_counts()
+    if threads is not None or _cores is None:
+        share_cores(threads or 0, variant)
+    else:
+        _set_thread_counts(renderer_threads(_cores), 1)
+    try:
+        yield
+    finally:
+        _set_thread_counts(*before)
 
 
 def _local_processes() -> int:
@@ -144,6 +163,21 @@ def _all_cores(count: Callable[[], int], change: Callable[[int], None]) -> Itera
         yield
     finally:
         change(before)
+
+
+def _thread_counts() -> tuple[int, int]:
+    """Dr.Jit's and torch's; where one is not loaded yet, what it will take, but two for files."""
+    cores = max(2, available_cores())
+    renderer, torch = sys.modules.get("drjit"), sys.modules.get("torch")
+    return renderer.thread_count() if renderer else cores, torch.get_num_threads() if torch else cores
+
+
+def _set_thread_counts(renderer: int, network: int) -> None:
+    import drjit as dr
+    import torch
+
+    dr.set_thread_count(renderer)
+    torch.set_num_threads(network)
 
 
 def _keep_freed_memory() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fd_mitsuba.backend.threads import share_cores_once
+from fd_mitsuba.backend.threads import own_threads
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object
@@ -82,6 +82,7 @@ class Run:
 
         return trimesh.load_mesh(self.folder / "export" / f"part_{name}.ply", process=False)
 
+    @own_threads()
     def export(
         self, formats: Collection[str | Choice] = ALL_FORMATS, *, faces: int | None = None, texture_size: int = 1024
     ) -> list[Path]:
@@ -96,12 +97,12 @@ class Run:
         Raises:
             UserError: no checkpoint there, an unknown format.
         """
-        share_cores_once()
         from fd_mitsuba.runs.pipeline import export_run
 
         written = export_run(self.folder, formats, texture_size, lambda line: None, faces)
         return [self.folder / "export" / name for name in written["files"]]
 
+    @own_threads()
     def render(
         self,
         name: str = "render",
@@ -121,7 +122,6 @@ class Run:
         Raises:
             UserError: the appearance stage has not begun, a size or count out of range.
         """
-        share_cores_once()
         from fd_mitsuba.runs.appearance_outcome import render_run
 
         return render_run(self.folder, dict(values or {}), name, views, size, spp, max_depth)
