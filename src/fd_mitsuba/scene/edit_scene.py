@@ -10,33 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import is_coarse, size_problem
+from fd_mitsuba.scene.base_mesh import base_mesh, element_triangles, placement
 from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
-from fd_mitsuba.scene.file_gate import mark_sound
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
 from fd_mitsuba.scene.focal_region import SUBTRACT, FocalRegion, PartPrompt
 from fd_mitsuba.scene.headroom import frame_with_headroom
-from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.scene.mesh_source import FILE_SHAPES, BrokenMesh, NotAMesh, shape_triangles
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
-from fd_mitsuba.scene.plugins import FOCAL_REGION, region_triangles
+from fd_mitsuba.scene.plugins import FOCAL_REGION
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
 from fd_mitsuba.scene.region_prompt import check_prompts, part_prompts, region_prompt
 from fd_mitsuba.scene.region_shapes import ELLIPSOID
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
-
-FOREIGN_MESHES = frozenset(".stl .glb .gltf .fbx .dae .off .3ds .blend .usd .usda .usdc .usdz .abc".split())
-"""Suffixes of meshes that people have and Mitsuba does not read; of some its OBJ reader makes an empty mesh."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +166,7 @@ def load_edit_scene(
     file = inputs.scene
     for source in inputs.sources:
         refuse_broken_properties(source)
-    base = tuple(_base_mesh(file, element) for element in base_elements(file))
+    base = tuple(base_mesh(file, element) for element in base_elements(file))
     earlier = earlier_parts(file.path, base)
     latest = max(earlier, key=lambda part: part.round, default=None)
     if not needs_region and prompt is None and not inputs.has_prompt:
@@ -238,7 +232,7 @@ def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> 
     """
     file = SceneFile(Path(path), dict(parameters or {}))
     refuse_broken_properties(file)
-    base = tuple(_base_mesh(file, element) for element in base_elements(file))
+    base = tuple(base_mesh(file, element) for element in base_elements(file))
     if not base:
         raise _without_base(file)
     return base
@@ -264,69 +258,6 @@ def _soup(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:
     return TriangleMesh(BASE_NAME, np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), sources)
 
 
-def _to_world(element: SceneElement) -> np.ndarray:
-    transform = element.properties.get("to_world")
-    matrix = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
-        raise element.error("to_world holds NaN or infinity; correct its numbers")
-    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
-        raise element.error("to_world is not affine (its last row is not 0 0 0 1); correct its matrix")
-    stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if stretch[-1] <= 1e-9 * stretch[0]:
-        raise element.error("to_world is singular (it flattens the shape); use scales other than 0")
-    return matrix
-
-
-def _triangles(file: SceneFile, element: SceneElement, filename: str | None) -> tuple[np.ndarray, np.ndarray]:
-    to_world = _to_world(element)
-    plain = {name: value for name, value in element.properties.items() if name != "to_world"}
-    if filename:
-        plain["filename"] = str(file.resolve(filename))
-    subject = f"{filename}: " if filename else ""
-    try:
-        with file.searching():
-            if element.plugin == FOCAL_REGION:
-                return region_triangles(file.mi, plain, to_world)
-            triangles = shape_triangles(file.mi, element.plugin, plain, to_world)
-            if element.plugin in FILE_SHAPES.values():
-                mark_sound(file, element)
-            return triangles
-    except UserError as error:
-        raise element.error(str(error)) from None
-    except NotAMesh:
-        raise element.error("cannot be turned into a mesh; use a mesh or a sphere, disk or cylinder") from None
-    except BrokenMesh as error:
-        fault = mesh_fault(file.resolve(filename)) if filename else None
-        raise element.error(f"{subject}{fault or f'{error}; repair the mesh and save it anew'}") from None
-    except MITSUBA_ERRORS as error:
-        if filename and (fault := mesh_fault(file.resolve(filename))):
-            raise element.error(f"{subject}{fault}") from None
-        problem = str(file.translated(error)).removeprefix(f"{file.path}: ")
-        raise element.error(f"{subject}{problem}") from None
-    except ValueError as error:
-        raise element.error(f"{error}; save it as one of these") from None
-
-
-def _base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:
-    filename = element.properties.get("filename")
-    if filename and Path(filename).suffix.lower() in FOREIGN_MESHES:
-        name, saved = Path(filename).name, Path(filename).with_suffix(".ply").name
-        raise element.error(
-            f"{filename}: Mitsuba reads PLY, OBJ and serialized meshes; convert it, in Blender or by "
-            f"trimesh.load({name!r}, force='mesh').export({saved!r})"
-        )
-    vertices, faces = _triangles(file, element, filename)
-    if filename and Path(filename).suffix.lower() == ".obj":
-        concave = obj_concave_face(file.resolve(filename))
-        if concave is not None:
-            raise element.error(
-                f"{filename}: face {concave} is not convex, and Mitsuba cuts it into triangles that lie outside of it; "
-                "triangulate the mesh as you export it"
-            )
-    sources = (file.resolve(filename),) if filename else ()
-    return TriangleMesh(element.id or BASE_NAME, vertices, faces, sources)
-
-
 def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
     soup = _soup(base)
     names = ", ".join(mesh.name for mesh in base)
@@ -348,11 +279,11 @@ def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
 
 
 def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame: Normalisation) -> FocalRegion:
-    to_world = _to_world(element)
+    to_world = placement(element)
     name = element.id or f"region_{index + 1}"
     mesh = None
     filename = element.properties.get("filename")
-    vertices, faces = _triangles(file, element, filename)
+    vertices, faces = element_triangles(file, element)
     if filename:
         if not topology(vertices, faces).closed:
             raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
