@@ -213,6 +213,7 @@ def edit(
     if isinstance(scene, (str, Path)):
         scene = load_scene(scene, plugins=config.plugins)
     load_plugins(config.plugins)
+    opening += [scene.base_choice] if scene.base_choice else []
     unknown = set(stages) - set(STAGES)
     if unknown or not stages:
         raise UserError(f"stages = {sorted(stages)}: give any of {', '.join(STAGES)}")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import BASE, write_ply
+from conftest import BASE, INTEGRATOR, write_ply
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import load_edit_scene
@@ -101,7 +101,8 @@ def test_mirrored_shapes_stay_outward(make_scene: Make, scale: str) -> None:
 
 def test_flat_shapes_beside_a_solid_are_fine(make_scene: Make) -> None:
     flat = shape("rectangle", name="ground") + shape("disk", name="plate")
-    scene = load_edit_scene(make_scene(base=BASE + flat))
+    named = INTEGRATOR.replace("<string", '<string name="base" value="plate, body, ground"/><string', 1)
+    scene = load_edit_scene(make_scene(base=BASE + flat, integrator=named))
     assert [mesh.name for mesh in scene.base] == ["body", "ground", "plate"]
     assert len(scene.base_soup.faces) == sum(len(mesh.faces) for mesh in scene.base)
 

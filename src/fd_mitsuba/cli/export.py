@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from fd_mitsuba.cli.options import definitions, machine_options, remark, say, start
+from fd_mitsuba.errors import UserError
 
 
 def add_export_commands(commands: argparse._SubParsersAction) -> None:
@@ -34,8 +35,13 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
         "-D", dest="definitions", action="append", default=[], metavar="NAME=VALUE", help="fill $NAME in the scene anew"
     )
     render.add_argument("-o", "--output", metavar="NAME", help="name of the images in RUN/renders; default: render")
-    render.add_argument("--views", type=int, default=8, metavar="N", help="images around the object; default: 8")
-    render.add_argument("--size", type=int, default=256, metavar="N", help="pixels a side; default: 256")
+    render.add_argument(
+        "--sensor",
+        metavar="ID",
+        help="instead: the exported scene as that sensor of its own shows it",
+    )
+    render.add_argument("--views", type=int, metavar="N", help="images around the object; default: 8")
+    render.add_argument("--size", type=int, metavar="N", help="pixels a side; default: 256")
     render.add_argument("--spp", type=int, default=128, metavar="N", help="samples a pixel; default: 128")
     render.add_argument("--depth", type=int, default=3, metavar="N", help="Mitsuba's max_depth; default: 3")
     machine_options(render)
@@ -81,10 +87,18 @@ def _parts(options: argparse.Namespace) -> int:
 
 def _render(options: argparse.Namespace) -> int:
     start(options)
-    from fd_mitsuba.runs.appearance_outcome import render_run
+    from fd_mitsuba.runs.appearance_outcome import render_by_sensor, render_run
 
-    settings = (options.views, options.size, options.spp, options.depth)
-    for path in render_run(Path(options.run), definitions(options), options.output or "render", *settings, remark):
+    run, name, changed = Path(options.run), options.output or "render", definitions(options)
+    if options.sensor is not None:
+        if options.views is not None or options.size is not None:
+            raise UserError("--sensor: renders one image of its film's size; leave out --views and --size")
+        paths = render_by_sensor(run, options.sensor, name, options.spp, options.depth, changed)
+    else:
+        views, size = (usual if given is None else given for given, usual in ((options.views, 8), (options.size, 256)))
+        settings = (views, size, options.spp, options.depth)
+        paths = render_run(run, changed, name, *settings, remark)
+    for path in paths:
         say(path)
     return 0
 

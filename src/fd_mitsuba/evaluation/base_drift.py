@@ -15,10 +15,10 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.judged_views import JudgedViews
 from fd_mitsuba.evaluation.picture_difference import psnr, ssim
 from fd_mitsuba.io.safe_text import safe_file_name, safe_name
-from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.mesh_source import BrokenMesh, NotAMesh, shape_triangles
-from fd_mitsuba.scene.scene_file import SceneElement, SceneFile, ready_mitsuba
+from fd_mitsuba.scene.scene_file import ready_mitsuba
 
 _SURFACE_POINTS = 20_000
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -53,7 +53,7 @@ def export_drift(scene: EditScene, folder: Path) -> dict[str, Any]:
     """
     exported = folder / "export" / "base"
     sources = {path for mesh in scene.base for path in mesh.source_files}
-    pictures = set(_pictures(scene.inputs.scene))
+    pictures = set(_pictures(scene))
     copies = {source: _copy_of(source, exported) for source in sources | pictures}
     present = {source: copy for source, copy in copies.items() if copy is not None}
     same = [_sha(source) == _sha(copy) for source, copy in present.items()]
@@ -88,7 +88,7 @@ def chamfer(one: Mesh, other: Mesh, seed: int = 0) -> float:
 def _exported_base(scene: EditScene, exported: Path, copies: dict[Path, Path | None]) -> Mesh | None:
     """All base shapes as the exported files have them, user frame; None if one is missing."""
     vertices, faces, first = [], [], 0
-    for element, mesh in zip(base_elements(scene.inputs.scene), scene.base, strict=True):
+    for element, mesh in zip(scene.base_elements, scene.base, strict=True):
         properties = {name: value for name, value in element.properties.items() if name != "to_world"}
         transform, plugin = element.properties.get("to_world"), element.plugin
         to_world = np.eye(4) if transform is None else np.array(getattr(transform, "matrix", transform), np.float64)
@@ -110,9 +110,9 @@ def _exported_base(scene: EditScene, exported: Path, copies: dict[Path, Path | N
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _pictures(file: SceneFile) -> Iterator[Path]:
+def _pictures(scene: EditScene) -> Iterator[Path]:
     """Files of the textures of the base's shapes."""
-    waiting: list[SceneElement] = base_elements(file)
+    file, waiting = scene.inputs.scene, [*scene.base_elements]
     while waiting:
         element = waiting.pop()
         name = element.properties.get("filename")

@@ -22,7 +22,7 @@ from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
 from fd_mitsuba.scene.region_mode import cut_faces_name
-from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
+from fd_mitsuba.scene.scene_file import SceneElement
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 PRINT = Print.leaves
@@ -72,7 +72,7 @@ def export_assets(
     whole = base_shapes(scene, file) if cut is None else cut.opened if textured else cut.shapes
     shapes = [shape for shape in whole if shape is not None and shape.name not in absent]
     kept = replace(scene, base=tuple(mesh for mesh in scene.base if mesh.name not in absent))
-    identical = copy_base(kept, folder / BASE_NAME, _base_textures(file, absent))
+    identical = copy_base(kept, folder / BASE_NAME, _base_textures(scene, absent))
     if cut is None:
         added = {f"part_{name}": (name, part) for name, part in parts.items() if name not in states}
     else:
@@ -90,7 +90,9 @@ def export_assets(
         written.append(name)
 
     corrected = {i: shape.corrected for i, shape in enumerate(whole) if shape is not None and shape.corrected}
-    record = {"texture_size": texture_size, "faces": face_budget}
+    record: dict[str, Any] = {"texture_size": texture_size, "faces": face_budget}
+    if scene.surroundings:
+        record["surroundings"] = scene.surroundings_ids
     content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write)
     for exporter in exporters:
         exporter.write(content)
@@ -144,9 +146,10 @@ def _cut_faces(cut: CutBase, parts: Mapping[str, PartAsset]) -> dict[str, PartAs
     }
 
 
-def _base_textures(file: SceneFile, absent: Collection[str]) -> list[Path]:
-    """Picture files that the materials of the scene's shapes read, without those of shapes with the ids `absent`."""
+def _base_textures(scene: EditScene, absent: Collection[str]) -> list[Path]:
+    """Picture files that the materials of the base read, without those of shapes with the ids `absent`."""
     found: dict[Path, None] = {}
+    file = scene.inputs.scene
 
     def visit(element: SceneElement) -> None:
         for index in element.children.values():
@@ -156,7 +159,7 @@ def _base_textures(file: SceneFile, absent: Collection[str]) -> list[Path]:
                 found[file.resolve(name)] = None
             visit(child)
 
-    for element in file.top_level("shape"):
+    for element in scene.base_elements:
         if element.id not in absent:
             visit(element)
     return list(found)

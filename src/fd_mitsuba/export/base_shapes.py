@@ -13,7 +13,7 @@ from fd_mitsuba.export.mesh_ply import mesh_ply
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.io.float_steps import is_coarse
 from fd_mitsuba.scene.double_positions import double_positions
-from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_numbers import correct_mesh
 from fd_mitsuba.scene.mesh_source import ANALYTIC
 from fd_mitsuba.scene.part_stack import StackedPart
@@ -68,7 +68,7 @@ def base_shapes(scene: EditScene, file: SceneFile) -> list[BaseShape]:
     """
     shapes = []
     earlier = {part.shape: part for part in scene.earlier}
-    for element, mesh in zip(base_elements(file), scene.base, strict=True):
+    for element, mesh in zip(scene.base_elements, scene.base, strict=True):
         bsdf = next((file.elements[i] for i in element.children.values() if file.elements[i].kind == "bsdf"), None)
         material = pbr_material(file, bsdf, mesh.name)
         if mesh.name in earlier:

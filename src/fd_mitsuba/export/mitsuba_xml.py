@@ -12,6 +12,7 @@ import numpy as np
 
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.io.safe_text import safe_file_name
+from fd_mitsuba.scene.base_choice import shapes_without_lamps
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import ANALYTIC
@@ -67,8 +68,10 @@ def mitsuba_scene(
     }
     cut = cut or {}
     own |= {name for name in cut.values() if name is not None}
-    shapes = 0
     file = inputs.scene
+    listed = iter(shapes_without_lamps(file))
+    numbers = {id(element): number for number, element in enumerate(scene.base_elements)}
+    around = {id(element): name for element, name in zip(scene.surroundings, scene.surroundings_ids, strict=True)}
     names = _Names(file, own)
     root = ET.Element("scene", {"version": "3.0.0"})
     for element in _elements(file):
@@ -77,11 +80,14 @@ def mitsuba_scene(
         if _is_part_bsdf(element):
             continue
         if element.tag == "shape" and element.find("emitter") is None:
-            shapes += 1
+            shape = next(listed)
+            number = numbers.get(id(shape))
             if element.get("id") in without:
                 continue
-            if shapes - 1 in cut:
-                ply = cut[shapes - 1]
+            if number is None:
+                element.set("id", around[id(shape)])
+            elif number in cut:
+                ply = cut[number]
                 if ply is None:
                     continue
                 _put_cut_mesh(element, ply)

@@ -16,7 +16,7 @@ from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
-from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import ANALYTIC
 
 _NOT_RENDERED = ("focal_region", "sensor", "integrator")
@@ -38,9 +38,10 @@ class AppearanceScene:
 
     Attributes:
         lit: everything, for shadows and bounces.
-        visible: what a camera sees: shapes that are lights are left out, as by Mitsuba's `hide_emitters`.
+        visible: what a camera sees: shapes that are lights are left out, as by Mitsuba's `hide_emitters`, and so are
+            surroundings, which would stand between the camera and the object.
         parts: the parts' meshes, in the order of the names.
-        base_shapes: the scene file's own shapes that are not lights, with their own BSDFs.
+        base_shapes: the base's shapes, with their own BSDFs.
     """
 
     lit: mi.Scene
@@ -79,9 +80,11 @@ class AppearanceScene:
         base = _opened(scene, [shape for shape in loaded.shapes() if not shape.is_emitter()], opened or {})
         # A light with a shape comes along with that shape.
         lights = [light for light in loaded.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Surface)]
-        lit = _scene([*base, *meshes, *lamps, *lights])
-        visible = _scene([*base, *meshes]) if lamps else lit
-        _keep_at_distance(lights, loaded.shapes(), scene)
+        surroundings = scene.mitsuba_surroundings()
+        around = surroundings.shapes() if surroundings is not None else []
+        lit = _scene([*base, *meshes, *lamps, *around, *lights])
+        visible = _scene([*base, *meshes]) if lamps or around else lit
+        _keep_at_distance(lights, [*loaded.shapes(), *around], scene)
         return cls(lit, visible, meshes, tuple(base))
 
     def set_vertex_values(self, part: int, values: Mapping[str, np.ndarray]) -> None:
@@ -125,7 +128,7 @@ def _opened(scene: EditScene, shapes: list[Any], opened: Mapping[int, Path | Non
     if not opened:
         return shapes
     left = []
-    for number, (shape, element) in enumerate(zip(shapes, base_elements(scene.inputs.scene), strict=True)):
+    for number, (shape, element) in enumerate(zip(shapes, scene.base_elements, strict=True)):
         path = opened.get(number)
         if path is None:
             left += [shape] * (number not in opened)

@@ -83,6 +83,10 @@ class CheckReport:
     """What the guidance model understands of the prompt; None where it takes any text, or where no model is asked."""
     part_readings: dict[str, PromptReading] = dataclasses.field(default_factory=dict)
     """The same of the prompts that parts have of their own."""
+    surroundings: tuple[str, ...] = ()
+    """Shapes of the scene that are not edited, as exports call them."""
+    base_choice: str = ""
+    """How it was found out which shapes are edited, where the scene does not say."""
     refusal: str | None = None
     """Why a run with these settings would end before its first step; None: it would not."""
 
@@ -104,6 +108,10 @@ class CheckReport:
             state = _closedness(found)
             pieces = f"{found.components} component{'s' if found.components != 1 else ''}"
             lines.append(f"base     {mesh.name}: {mesh.vertices} vertices, {mesh.faces} faces, {state}, {pieces}")
+        if self.surroundings:
+            lines.append(f"around   {', '.join(self.surroundings)}: lit, cast shadows and reflect, are not edited")
+        if self.base_choice:
+            lines.append("         chosen by where the regions are; dual_path's `base` names the shapes to edit")
         lines.append(f"frame    longest side {self.longest_side:.4g}, grid cell {self.grid_cell:.3g} (scene units)")
         lines.append(f"         base {_box(self.base_low, self.base_high)}")
         roomy = ", enlarged to hold the regions" if self.has_headroom else ""
@@ -172,6 +180,8 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         ),
         prompt_reading=reading,
         part_readings=part_readings,
+        surroundings=tuple(scene.surroundings_ids),
+        base_choice=scene.base_choice,
         refusal=refusal,
     )
 

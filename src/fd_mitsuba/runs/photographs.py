@@ -88,8 +88,9 @@ class PhotoViews:
     def of(cls, scene: EditScene, folder: Path, size: int = _TURN_SIZE) -> PhotoViews:
         """Those of a run folder whose Mitsuba scene has been exported; `size` is what `exposure` is found at."""
         away, frame, base = ("focal_region", "sensor", "integrator"), scene.render_frame, scene.base_canonical.vertices
-        exported, original = SceneFile(folder / "export" / "mitsuba" / "scene.xml"), scene.inputs.scene
-        loaded = exported.instantiate(without=away, origin=scene.origin)
+        exported = SceneFile(folder / "export" / "mitsuba" / "scene.xml")
+        shown = [shape for shape in exported.top_level("shape") if shape.id not in scene.surroundings_ids]
+        loaded = exported.instantiate(without=away, origin=scene.origin, shapes=shown)
         old = {part.shape for part in scene.earlier}
         grown = [shape for shape in loaded.shapes() if shape.id().startswith(_GROWN) and shape.id() not in old]
         names = [shape.id() for shape in grown]
@@ -98,7 +99,7 @@ class PhotoViews:
         parts = np.concatenate(corners) if corners else base
         ground = float(whole[:, 1].min())
         after = PhotoSet.of(exported.mi, loaded, frame, ground)
-        without = original.instantiate(without=away, origin=scene.origin)
+        without = scene.mitsuba_scene(without=away)
         before = PhotoSet.of(exported.mi, without, frame, ground)
         camera = _from_best_side(after, names, whole, _FILL)
         close = _from_best_side(after, names, parts, _CLOSE_FILL)

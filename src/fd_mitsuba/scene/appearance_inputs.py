@@ -13,7 +13,7 @@ from fd_mitsuba.backend.startup import NORMALS, UVS, VERTICES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.bsdf_reading import COLOURS
-from fd_mitsuba.scene.edit_scene import EditScene, base_elements
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.lit_side import shading_warnings
 from fd_mitsuba.scene.mesh_diagnosis import obj_has_colours
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
@@ -65,7 +65,7 @@ def check_appearance_inputs(scene: EditScene) -> tuple[str, ...]:
     if part is not None:
         _check_shares(part)
     loaded, shapes = base_shapes(scene)
-    for element, shape in zip(base_elements(file), shapes, strict=True):
+    for element, shape in zip(scene.base_elements, shapes, strict=True):
         if isinstance(shape, file.mi.Mesh):
             _check_textures(file, element, shape, warnings)
     return (*warnings, *check_shading(scene, loaded, shapes))

@@ -96,6 +96,24 @@ class EditInputs:
                 return str(unit)
         return None
 
+    def base_names(self) -> tuple[SceneElement, list[str]] | None:
+        """The ids of the shapes to edit and the integrator that names them; None where none does.
+
+        Raises:
+            UserError: it names nothing.
+        """
+        for file in reversed(self.sources):
+            for element in file.top_level("integrator"):
+                text = element.properties.get("base", "") if element.plugin == DUAL_PATH else ""
+                if not isinstance(text, str):
+                    raise element.error('base is not text; write <string name="base" value="ids of shapes"/>')
+                names = [name.strip() for name in text.split(",") if name.strip()]
+                if "base" in element.properties and element.plugin == DUAL_PATH and not names:
+                    raise element.error("base is blank; name the shapes to edit, separated by commas, or leave it out")
+                if names:
+                    return element, names
+        return None
+
     def part_bsdf(self) -> tuple[SceneFile, SceneElement | None]:
         """`<bsdf id="part">` and the file that it is in; None and the scene where there is none."""
         for file in reversed(self.sources):

@@ -13,7 +13,8 @@ import numpy as np
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import is_coarse, size_problem
-from fd_mitsuba.scene.base_mesh import base_mesh, element_triangles, placement
+from fd_mitsuba.scene.base_choice import choose_base
+from fd_mitsuba.scene.base_mesh import element_triangles, placement
 from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
@@ -23,8 +24,7 @@ from fd_mitsuba.scene.headroom import frame_with_headroom
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import part_names
-from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts
-from fd_mitsuba.scene.plugins import FOCAL_REGION
+from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts, free_name
 from fd_mitsuba.scene.region_mode import check_modes, region_mode
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
 from fd_mitsuba.scene.region_prompt import check_prompts, part_prompts, region_prompt
@@ -45,6 +45,10 @@ class EditScene:
         base_prompt: what the base looks like, "" if not given.
         negative_prompt: what to keep away from, "" if not given.
         base: the base's meshes in the user frame, after their `to_world`.
+        base_elements: the shapes in the file that they are of, one each.
+        surroundings: the file's other shapes, regions and area lights apart: light and shadow of the appearance stage
+            and of renders know them, nothing else.
+        base_choice: a line that tells which shapes are edited, where that was found out; else "".
         regions: the focal regions, in the canonical frame.
         frame: the map between the two frames.
         files: every file that is read, the scene file and its includes first.
@@ -63,6 +67,9 @@ class EditScene:
     base: tuple[TriangleMesh, ...]
     regions: tuple[FocalRegion, ...]
     frame: Normalisation
+    base_elements: tuple[SceneElement, ...] = field(default=(), repr=False, compare=False)
+    surroundings: tuple[SceneElement, ...] = field(default=(), repr=False, compare=False)
+    base_choice: str = ""
     base_prompt: str = ""
     negative_prompt: str = ""
     parameters: dict[str, str] = field(default_factory=dict)
@@ -134,9 +141,30 @@ class EditScene:
         soup = self.base_soup
         return TriangleMesh(BASE_NAME, self.frame.to_canonical(soup.vertices), soup.faces, soup.source_files)
 
+    @cached_property
+    def surroundings_ids(self) -> list[str]:
+        """What each of `surroundings` is called in exports: its id, or one that no shape has yet."""
+        taken = {shape.id for shape in self.inputs.scene.top_level("shape")}
+        names = []
+        for shape in self.surroundings:
+            names.append(shape.id or free_name("surroundings", taken))
+            taken.add(names[-1])
+        return names
+
     def mitsuba_scene(self, without: tuple[str, ...] = ()) -> Any:
-        """The scene file as an `mi.Scene` in the render frame; see `SceneFile.instantiate`."""
-        return self.inputs.scene.instantiate(without, self.origin)
+        """The scene file as an `mi.Scene` in the render frame without its surroundings; see `SceneFile.instantiate`."""
+        file = self.inputs.scene
+        shapes = None
+        if self.surroundings:
+            around = {id(shape) for shape in self.surroundings}
+            shapes = [shape for shape in file.top_level("shape") if id(shape) not in around]
+        return file.instantiate(without, self.origin, shapes)
+
+    def mitsuba_surroundings(self) -> Any | None:
+        """The surroundings alone as an `mi.Scene` in the render frame; None without any."""
+        if not self.surroundings:
+            return None
+        return self.inputs.scene.instantiate(("sensor", "integrator", "emitter"), self.origin, self.surroundings)
 
 
 def load_edit_scene(
@@ -166,7 +194,13 @@ def load_edit_scene(
     file = inputs.scene
     for source in inputs.sources:
         refuse_broken_properties(source)
-    base = tuple(base_mesh(file, element) for element in base_elements(file))
+    elements = inputs.region_elements()
+
+    def provisional(frame: Normalisation) -> list[FocalRegion]:
+        return [_region(owner, element, index, "", frame) for index, (owner, element) in enumerate(elements)]
+
+    choice = choose_base(inputs, provisional)
+    base = choice.meshes
     earlier = earlier_parts(file.path, base)
     latest = max(earlier, key=lambda part: part.round, default=None)
     if not needs_region and prompt is None and not inputs.has_prompt:
@@ -175,7 +209,6 @@ def load_edit_scene(
     if not base:
         raise _without_base(file)
     frame = _frame(file, base)
-    elements = inputs.region_elements()
     if not elements and needs_region:
         remedy = 'add <shape type="focal_region" id="..."> where to edit, or give a file with it by --regions'
         raise UserError(f"{inputs.sources[-1].path}: no focal region; {remedy}")
@@ -208,6 +241,9 @@ def load_edit_scene(
         inputs=inputs,
         prompt=prompts[0],
         base=base,
+        base_elements=choice.base,
+        surroundings=choice.surroundings,
+        base_choice=choice.how,
         regions=found,
         frame=frame,
         base_prompt=prompts[1],
@@ -232,7 +268,7 @@ def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> 
     """
     file = SceneFile(Path(path), dict(parameters or {}))
     refuse_broken_properties(file)
-    base = tuple(base_mesh(file, element) for element in base_elements(file))
+    base = choose_base(EditInputs(file)).meshes
     if not base:
         raise _without_base(file)
     return base
@@ -240,15 +276,6 @@ def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> 
 
 def _without_base(file: SceneFile) -> UserError:
     return UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
-
-
-def base_elements(file: SceneFile) -> list[SceneElement]:
-    """The shapes that make up the base, in file order: those that are neither regions nor area lights."""
-
-    def emits(element: SceneElement) -> bool:
-        return any(file.elements[child].kind == "emitter" for child in element.children.values())
-
-    return [item for item in file.top_level("shape") if item.plugin != FOCAL_REGION and not emits(item)]
 
 
 def _soup(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:

@@ -135,5 +135,10 @@ def _entry(values: dict[str, Any]) -> StackedPart:
     return part
 
 
+def is_part(shape: str) -> bool:
+    """Whether a shape's id is that of an exported part."""
+    return bool(_name(shape))
+
+
 def _name(shape: str) -> str:
     return shape.removeprefix(_PREFIX) if shape.startswith(_PREFIX) else ""

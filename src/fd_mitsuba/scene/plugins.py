@@ -131,6 +131,7 @@ def _dual_path_class(mi: Any) -> Any:
             self.base_prompt = properties.get("base_prompt", "")
             self.negative_prompt = properties.get("negative_prompt", "")
             self.simple_prompt = properties.get("simple_prompt", "")
+            self.base = properties.get("base", "")
             self.unit = properties.get("unit", "")
             self.only_these_regions = properties.get("only_these_regions", False)
             self._preview = mi.load_dict({"type": "path", "max_depth": 4})

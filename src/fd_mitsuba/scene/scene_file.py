@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -114,13 +114,19 @@ class SceneFile:
         """The elements of one kind directly below `<scene>`, in file order."""
         return [element for element in self.elements if element.top_level and element.kind == kind]
 
-    def instantiate(self, without: tuple[str, ...] = (), origin: np.ndarray | None = None) -> Any:
+    def instantiate(
+        self,
+        without: tuple[str, ...] = (),
+        origin: np.ndarray | None = None,
+        shapes: Collection[SceneElement] | None = None,
+    ) -> Any:
         """The `mi.Scene`, with meshes and BSDFs kept apart (nothing merged) and ids as in the file.
 
         Args:
             without: top-level objects to leave out, by kind or plugin type, such as ("focal_region", "sensor").
             origin: (3,) the point of the file's frame that is at the scene's origin, for scenes that lie so far away
                 that 32-bit floats show; None: the file's own.
+            shapes: of the top-level shapes, those to keep; None: all.
 
         Raises:
             UserError: a mesh that would break Mitsuba; a plugin that fails, is unknown, or does not know a property.
@@ -128,8 +134,14 @@ class SceneFile:
         with self.searching():
             check_meshes(self)
             state = self._parse()
-            if without:
-                self._drop(state, without)
+            dropped = {i for i, item in enumerate(self.elements) if {item.kind, item.plugin} & set(without)}
+            if shapes is not None:
+                staying = {id(shape) for shape in shapes}  # by identity: two shapes may say the same
+                dropped |= {
+                    i for i, item in enumerate(self.elements) if item.kind == "shape" and id(item) not in staying
+                }
+            if dropped:
+                self._drop(state, dropped)
             self._find_copies(state)
             if origin is not None and np.any(origin):
                 root = state.root.props
@@ -140,10 +152,11 @@ class SceneFile:
             except MITSUBA_ERRORS as error:
                 raise (fault_of_file(self, error) or self.translated(error)) from None
             scene = scene[0] if isinstance(scene, list) else scene
-            kept = [shape for shape in self.top_level("shape") if not {shape.kind, shape.plugin} & set(without)]
-            shapes = scene.shapes() if kept else []
+            left = (item for i, item in enumerate(self.elements) if i not in dropped)
+            kept = [item for item in left if item.top_level and item.kind == "shape"]
+            loaded = scene.shapes() if kept else []
             # A plugin that makes several shapes of one, such as `merge`, leaves nothing to say which is whose.
-            pairs = list(zip(kept, shapes, strict=True)) if len(kept) == len(shapes) else []
+            pairs = list(zip(kept, loaded, strict=True)) if len(kept) == len(loaded) else []
             if origin is not None and np.any(origin):
                 restore_digits(self, scene, pairs, origin)
             numbers = [correct_mesh(self, element, shape) for element, shape in pairs]
@@ -244,9 +257,9 @@ class SceneFile:
             if isinstance(name, str) and name in self._copied:
                 node.props["filename"] = str(self._copied[name])
 
-    def _drop(self, state: Any, without: tuple[str, ...]) -> None:
+    def _drop(self, state: Any, dropped: Collection[int]) -> None:
+        """Take elements at these positions out of the scene, where they are directly below it."""
         root = state.root.props
         for key in self._links(root):
-            node = state.nodes[self._index(root, key)]
-            if {_kind(node), node.props.plugin_name()} & set(without):
+            if self._index(root, key) - 1 in dropped:  # node 0 is the scene itself, which is no element
                 del root[key]

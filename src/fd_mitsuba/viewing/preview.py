@@ -60,9 +60,8 @@ def region_colours(count: int) -> list[tuple[float, float, float]]:
 
 def _base_pictures(scene: EditScene, views: Sequence[ParallelView], size: int) -> tuple[np.ndarray, np.ndarray]:
     """sRGB pictures (B, 2 size, 2 size, 3) in [0, 1] on paper, and the base's distance (canonical units)."""
-    file = scene.inputs.scene
-    mi = file.mi
-    loaded = file.instantiate(without=("focal_region", "sensor", "integrator"), origin=scene.origin)
+    mi = scene.inputs.scene.mi
+    loaded = scene.mitsuba_scene(without=("focal_region", "sensor", "integrator"))
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
     radiance, cover = [], []
     for index, view in enumerate(views):
