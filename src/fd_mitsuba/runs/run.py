@@ -112,18 +112,23 @@ class Run:
         size: int = 256,
         spp: int = 128,
         max_depth: int = 3,
+        sensor: str | None = None,
     ) -> list[Path]:
         """Render the object all around; returns the sheet's path and those of the single images.
 
         Args:
+            sensor: instead, one image of the exported scene, surroundings included, by the sensor of its own with this
+                id; then `views`, `size` and `values` are of no use.
             name: of the images in `folder/renders`.
             values: other values for the scene's `$name`, such as `{"light": "../lighting/sunset.exr"}`.
 
         Raises:
             UserError: the appearance stage has not begun, a size or count out of range.
         """
-        from fd_mitsuba.runs.appearance_outcome import render_run
+        from fd_mitsuba.runs.appearance_outcome import render_by_sensor, render_run
 
+        if sensor is not None:
+            return render_by_sensor(self.folder, sensor, name, spp, max_depth, dict(values or {}))
         return render_run(self.folder, dict(values or {}), name, views, size, spp, max_depth)
 
     def show(self) -> Any:
