@@ -43,6 +43,18 @@ def beside(folder: Path, name: str) -> Path:
     return folder / place
 
 
+def found_beside(folder: Path, name: str) -> Path | None:
+    """The image beside an asset, as the name says or by its last part: many files name folders of their makers."""
+    for choice in (name, PurePosixPath(name.replace("\\", "/")).name):
+        try:
+            path = beside(folder, choice)
+        except BrokenAsset:
+            continue
+        if path.is_file():
+            return path
+    return None
+
+
 def read_image(path: Path) -> TextureImage:
     """An image file.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from fd_mitsuba.assets.asset import AssetMaterial, Texture, TextureImage
 from fd_mitsuba.assets.broken import BrokenAsset
-from fd_mitsuba.assets.images import beside, pixels, read_image
+from fd_mitsuba.assets.images import found_beside, pixels, read_image
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
 _MOST_BYTES = 1 << 26
@@ -116,7 +116,7 @@ def _texture(
     name = " ".join(words[place:])
     if not name:
         return None
-    path = _found(folder, name)
+    path = found_beside(folder, name)
     if path is None:
         notes.append(f"material {material!r}: its image {name[:60]!r} is not beside the OBJ and is left out")
         return None
@@ -127,18 +127,6 @@ def _texture(
     # v runs upwards in an OBJ: v' = s v + o is s v + (1 - s - o) with v from the top.
     to_uv = np.array([[scale[0], 0, offset[0]], [0, scale[1], 1 - scale[1] - offset[1]], [0, 0, 1.0]])
     return Texture(images[path], to_uv, "clamp" if clamp else "repeat")
-
-
-def _found(folder: Path, name: str) -> Path | None:
-    """The image beside the OBJ, as the name says or by its last part, since many files name folders of their makers."""
-    for choice in (name, PurePosixPath(name.replace("\\", "/")).name):
-        try:
-            path = beside(folder, choice)
-        except BrokenAsset:
-            continue
-        if path.is_file():
-            return path
-    return None
 
 
 def _numbers(words: list[str]) -> list[float]:

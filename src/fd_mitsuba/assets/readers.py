@@ -26,6 +26,7 @@ READERS: dict[str, Callable[[Path], Asset]] = {
     ".glb": _reader("gltf", "read_gltf"),
     ".gltf": _reader("gltf", "read_gltf"),
     ".obj": _reader("obj", "read_obj"),
+    ".dae": _reader("dae", "read_dae"),
     ".ply": _reader("ply", "read_ply_asset"),
     ".stl": _reader("plain_meshes", "read_stl"),
     ".off": _reader("plain_meshes", "read_off"),

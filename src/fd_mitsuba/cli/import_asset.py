@@ -11,7 +11,7 @@ from fd_mitsuba.cli.scene_options import axis_options, placing_options
 
 def add_import_command(commands: argparse._SubParsersAction) -> None:
     """Put `import` beside the other commands."""
-    parser = commands.add_parser("import", help="make a scene to edit out of a GLB, OBJ, PLY, STL or OFF")
+    parser = commands.add_parser("import", help="make a scene to edit out of a GLB, OBJ, DAE, PLY, STL or OFF")
     parser.add_argument("asset", help="mesh file: .glb .gltf .obj .ply .stl .off")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="the scene's folder; default: scenes/<asset>")
     parser.add_argument("--prompt", help="what the edited object should look like")

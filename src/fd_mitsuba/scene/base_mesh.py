@@ -19,6 +19,8 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 FOREIGN_MESHES = frozenset(".stl .glb .gltf .fbx .dae .off .3ds .blend .usd .usda .usdc .usdz .abc".split())
 """Suffixes of meshes that people have and Mitsuba does not read; of some its OBJ reader makes an empty mesh."""
 
+_IMPORTED = (".stl", ".glb", ".gltf", ".dae", ".off")
+
 
 def placement(element: SceneElement) -> np.ndarray:
     """A shape's `to_world`, (4, 4) float64.
@@ -82,10 +84,12 @@ def base_mesh(file: SceneFile, element: SceneElement) -> TriangleMesh:
     """
     filename = element.properties.get("filename")
     if filename and Path(filename).suffix.lower() in FOREIGN_MESHES:
-        name, saved = Path(filename).name, Path(filename).with_suffix(".ply").name
+        name = Path(filename).name
+        imported = name if Path(filename).suffix.lower() in _IMPORTED else f"{Path(filename).stem}.glb"
+        first = "" if imported == name else "save it as GLB, as from Blender, and "
         raise element.error(
-            f"{filename}: Mitsuba reads PLY, OBJ and serialized meshes; convert it, in Blender or by "
-            f"trimesh.load({name!r}, force='mesh').export({saved!r})"
+            f"{filename}: Mitsuba reads PLY, OBJ and serialized meshes; {first}make a scene of it: "
+            f"fd_mitsuba import {imported} -o FOLDER"
         )
     vertices, faces = element_triangles(file, element)
     if filename and Path(filename).suffix.lower() == ".obj":
