@@ -13,6 +13,7 @@ import pytest
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.studio.history import History
 from fd_mitsuba.studio.job import RunOrder
 from fd_mitsuba.studio.opening import open_target
 from fd_mitsuba.studio.plain_text import without_paths
@@ -211,3 +212,52 @@ def test_no_path_of_the_disk_is_shown(session: Session, tmp_path: Path) -> None:
     report = session.check_now()
     for text in (str(report.refusal), *report.warnings, *report.regions):
         assert not re.search(r"(^|\s)/\w+/", session.plain(text))
+
+
+def test_undo_and_redo(session: Session) -> None:
+    session._history = History(clock=iter(range(0, 1000, 10)).__next__)  # nothing follows at once
+    first = session.state.regions.poses["wing"]
+    moved = replace(first, centre=(0.2, 0.3, 0.0))
+    session.put(moved)
+    image = session.mirror("wing")
+    session.set_prompt("a pig with a hat")
+    session.remove(image)
+    topics: list[str] = []
+    session.subscribe(topics.append)
+    session.undo()
+    assert list(session.state.regions.poses) == ["wing", image] and session.state.selected == image
+    assert topics == ["prompt", "regions"]
+    session.undo()
+    assert session.state.prompt == "a pig with two wings"
+    session.undo()
+    session.undo()
+    assert session.state.regions.poses == {"wing": first}
+    with pytest.raises(UserError, match="nothing to undo"):
+        session.undo()
+    for _ in range(3):
+        session.redo()
+    assert session.state.prompt == "a pig with a hat" and session.state.regions.poses["wing"] == moved
+    session.put(first)  # another way from here
+    with pytest.raises(UserError, match="nothing to redo"):
+        session.redo()
+
+
+def test_a_drag_is_one_change_to_undo(session: Session) -> None:
+    times = iter([0.0, 0.1, 0.2, 5.0])
+    session._history = History(clock=times.__next__)
+    first = session.state.regions.poses["wing"]
+    for x in (0.1, 0.2, 0.3):
+        session.put(replace(first, centre=(x, 0.3, 0.0)))
+    session.put(replace(first, centre=(0.9, 0.3, 0.0)))
+    session.undo()
+    assert session.state.regions.poses["wing"].centre[0] == 0.3
+    session.undo()
+    assert session.state.regions.poses["wing"] == first
+
+
+def test_only_a_finished_run_is_compared(session: Session) -> None:
+    name = session.grow()
+    with pytest.raises(UserError, match=f"run {name}: has no result yet"):
+        session.compare(name)
+    session.compare("")
+    assert session.beside == ""

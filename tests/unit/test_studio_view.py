@@ -15,6 +15,7 @@ from fd_mitsuba.io.ply import ply_bytes
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.studio.job import EventWriter
 from fd_mitsuba.studio.opening import open_target
+from fd_mitsuba.studio.run_state import FINISHED
 from fd_mitsuba.studio.session import Session
 from fd_mitsuba.studio.settings import StudioSettings
 
@@ -105,3 +106,31 @@ def test_selected_region_leaves_clicks_to_its_gizmo(view: View) -> None:
     assert view.canvas._clickable == {"wing"} and view.panel.region.value == name
     view.session.select("wing")
     assert view.canvas._clickable == {name}
+
+
+def test_a_finished_result_stands_beside(view: View) -> None:
+    session, client = view.session, Client()
+    name = session.grow()
+    run = session.queue.runs[name]
+    (run.folder / "export").mkdir(parents=True)
+    glb = session.state.glb
+    (run.folder / "export" / "asset.glb").write_bytes(glb)
+    run.state = FINISHED
+    session.show("")
+    label = view.panel.beside.options[1]
+    typed(view.panel.beside, label, client)
+    handle = view.canvas._beside
+    assert handle.glb_data == glb and client.notes == []
+    base = view.canvas._base
+    apart = np.array(handle.position) - np.array(base.position)
+    assert apart[0] > np.ptp(session.state.base.vertices[:, 0]) and apart[1:] == pytest.approx([0, 0])
+    typed(view.panel.beside, view.panel.beside.options[0], client)
+    assert view.canvas._beside is None and session.beside == ""
+
+
+def test_buttons_undo_what_was_done(view: View) -> None:
+    client, state = Client(), view.session.state
+    typed(view.panel.radii[1], 0.4, client)
+    view.session.undo()
+    assert state.regions.poses["wing"].radii == pytest.approx((0.12, 0.25, 0.15))
+    assert view.panel.radii[1].value == pytest.approx(0.25, abs=1e-3)

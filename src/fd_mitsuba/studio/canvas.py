@@ -54,6 +54,7 @@ class Canvas:
         self._gizmo: Any = None
         self._base: Any = None
         self._part: Any = None
+        self._beside: Any = None
         self._wires: dict[str, tuple[np.ndarray, np.ndarray, Any]] = {}
         """`base` and `part` -> vertices, faces, and the lines once somebody wanted to see them."""
         self.base_hidden = False
@@ -170,6 +171,21 @@ class Canvas:
             self._part = self._glb("/part", glb, frame)
             self._set_wires("part", vertices, faces)
             self.apply_visibility()
+
+    def show_beside(self, glb: bytes | None, frame: Normalisation, aside: float = 0.0) -> None:
+        """Another result, base and part, beside the first; None: none.
+
+        Args:
+            glb: in the user frame.
+            aside: how far to the right, canonical units.
+        """
+        with self.server.atomic():
+            if self._beside is not None:
+                self._beside.remove()
+                self._beside = None
+            if glb is not None:
+                place = -frame.scale * frame.centre + np.array([aside, 0.0, 0.0])
+                self._beside = self._scene.add_glb("/beside", glb, scale=frame.scale, position=place)
 
     def show_no_part(self) -> None:
         """Nothing but the base."""

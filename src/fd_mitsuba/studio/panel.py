@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 AXES = {"left - right (x)": 0, "below - above (y)": 1, "back - front (z)": 2}
 _REGION_BUTTONS = {"Add on top": "add", "Mirror": "mirror", "Remove": "remove"}
+_STEPS = {"Undo": "undo", "Redo": "redo"}
 _NO_RUN = "none yet"
+_ALONE = "nothing"
 _MOST_LOSSES = 4
 _EMPTY_CHART = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
 
@@ -96,6 +98,8 @@ class Panel:
         buttons.on_click(self._heard(lambda event: self._actions[_REGION_BUTTONS[event.target.value]](event)))
         self.axis = self._gui.add_dropdown("Mirror along", list(AXES))
         self._button("Add by a click on the base", "pick", icon="click")
+        steps = self._gui.add_button_group("Change", tuple(_STEPS))
+        steps.on_click(self._heard(lambda event: self._actions[_STEPS[event.target.value]](event)))
         self.check = self._gui.add_markdown("checking...")
 
     def _field_changed(self) -> None:
@@ -133,6 +137,8 @@ class Panel:
     def _result(self) -> None:
         self.shown = self._gui.add_dropdown("Run", [_NO_RUN])
         self.shown.on_update(self._do("show"))
+        self.beside = self._gui.add_dropdown("Beside it", [_ALONE], hint="another result, to compare")
+        self.beside.on_update(self._do("compare"))
         self.status = self._gui.add_markdown("")
         self.bar = self._gui.add_progress_bar(0.0)
         self.chart = self._gui.add_uplot(
@@ -197,6 +203,10 @@ class Panel:
         names = list(labels.values()) or [_NO_RUN]
         if tuple(names) != tuple(self.shown.options):
             self.shown.options = names
+        finished = [_ALONE, *(labels[run.name] for run in session.queue.runs.values() if run.state == FINISHED)]
+        if tuple(finished) != tuple(self.beside.options):
+            self.beside.options = finished
+        self.beside.value = labels.get(session.beside, _ALONE)
         run = session.queue.runs.get(session.shown)
         self.shown.value = names[-1] if run is None else labels[run.name]
         state = "" if run is None else run.state

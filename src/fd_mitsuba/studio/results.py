@@ -73,6 +73,15 @@ def shown_part(run: RunState, frame: Normalisation) -> ShownPart | None:
     return ShownPart(key, vertices, faces, asset if cut else only_parts(asset, names), cut)
 
 
+def whole_result(run: RunState) -> bytes:
+    """A finished run's GLB: base and part with their materials, user frame.
+
+    Raises:
+        UserError: it is not there.
+    """
+    return _read(run.folder / "export" / "asset.glb")
+
+
 def download(run: RunState, wanted: str) -> tuple[str, bytes]:
     """File name and bytes of a finished run's result.
 
@@ -89,7 +98,7 @@ def download(run: RunState, wanted: str) -> tuple[str, bytes]:
         raise UserError(f"run {run.name}: has no result yet; let it finish first")
     stem = f"part_{run.name}"
     if wanted == "GLB":
-        return f"{stem}.glb", _read(export / "asset.glb")
+        return f"{stem}.glb", whole_result(run)
     if wanted == "Mitsuba scene":
         return f"{stem}_mitsuba.zip", _zipped(export / "mitsuba")
     kind = wanted.lower()

@@ -24,6 +24,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.studio.debounce import Debounced
 from fd_mitsuba.studio.edit_state import EditState
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
+from fd_mitsuba.studio.history import History, Snapshot
 from fd_mitsuba.studio.job import RunOrder
 from fd_mitsuba.studio.live_check import LiveCheck, live_check
 from fd_mitsuba.studio.opening import Opened
@@ -31,6 +32,7 @@ from fd_mitsuba.studio.picking import first_hit
 from fd_mitsuba.studio.plain_text import without_paths
 from fd_mitsuba.studio.queue import PROGRAM, RunQueue
 from fd_mitsuba.studio.region_list import RegionList
+from fd_mitsuba.studio.run_state import FINISHED
 from fd_mitsuba.studio.settings import StudioSettings
 
 _LONGEST_PROMPT = 1000
@@ -54,6 +56,7 @@ class Session:
         queue: the runs.
         check: the newest check; None: there is none yet.
         shown: name of the run that the page shows, "" for none.
+        beside: name of a finished run that is shown beside it, to compare; "" for none.
 
     Raises:
         UserError: the work folder or its scene cannot be read or written.
@@ -79,6 +82,8 @@ class Session:
         for folder in [*self.work.adopted(), *([opened.run] if opened.run is not None else [])]:
             self.queue.adopt(folder)
         self.shown = opened.shown or next(reversed(self.queue.runs), "")
+        self.beside = ""
+        self._history = History()
         self.save()
 
     def subscribe(self, listener: Listener) -> None:
@@ -112,7 +117,9 @@ class Session:
         with self.lock:
             if self.state.regions.pose(pose.name) == pose:
                 return  # a field that only echoes what the model has told it
+            before = self._snapshot()
             self.state.regions.put(pose)
+            self._history.before(f"put {pose.name}", before)
         self._tell("pose", check=True)
 
     def add_at(self, origin: Sequence[float], direction: Sequence[float]) -> str | None:
@@ -136,15 +143,41 @@ class Session:
     def remove(self, name: str) -> None:
         """Take a region away; UserError for the last one."""
         with self.lock:
+            before = self._snapshot()
             self.state.regions.remove(name)
+            self._history.before("remove", before)
             self.state.selected = next(iter(self.state.regions.poses), "")
         self._tell("regions", check=True)
 
     def _chosen(self, made: Callable[[RegionList], EllipsoidPose]) -> str:
         with self.lock:
+            before = self._snapshot()
             self.state.selected = name = made(self.state.regions).name
+            self._history.before(f"add {name}", before)
         self._tell("regions", check=True)
         return name
+
+    def undo(self) -> None:
+        """Take the last change of regions or prompt back; UserError where there is none."""
+        self._return_to(self._history.undo, "nothing to undo")
+
+    def redo(self) -> None:
+        """Make a change again that was undone; UserError where there is none."""
+        self._return_to(self._history.redo, "nothing to redo")
+
+    def _snapshot(self) -> Snapshot:
+        state = self.state
+        return Snapshot(tuple(state.regions.poses.values()), state.selected, state.prompt)
+
+    def _return_to(self, step: Callable[[Snapshot], Snapshot | None], otherwise: str) -> None:
+        with self.lock:
+            found = step(self._snapshot())
+            if found is None:
+                raise UserError(otherwise)
+            self.state.regions.poses = {pose.name: pose for pose in found.poses}
+            self.state.selected, self.state.prompt = found.selected, found.prompt
+        self._tell("prompt")
+        self._tell("regions", check=True)
 
     # Prompt and settings
 
@@ -156,6 +189,7 @@ class Session:
         with self.lock:
             if words == self.state.prompt:
                 return
+            self._history.before("prompt", self._snapshot())
             self.state.prompt = words
         self._tell("prompt", check=True)
 
@@ -230,6 +264,15 @@ class Session:
             self.shown = name
         self._tell("runs")
 
+    def compare(self, name: str) -> None:
+        """Let the page show the result of a run beside the other; "" for none; UserError where it has none yet."""
+        with self.lock:
+            run = self.queue.runs.get(name)
+            if name and (run is None or run.state != FINISHED):
+                raise UserError(f"run {name}: has no result yet; let it finish first")
+            self.beside = name
+        self._tell("runs")
+
     def save_scene(self) -> str:
         """See `EditState.save_scene`."""
         with self._mitsuba:
@@ -245,7 +288,8 @@ class Session:
         with self._mitsuba:
             state = self.state.next_round(run)
         with self.lock:
-            self.state, self.shown, self.check = state, "", None
+            self.state, self.shown, self.beside, self.check = state, "", "", None
+            self._history.clear()
             self.save()
         self._tell("scene", check=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.studio.canvas import Canvas
 from fd_mitsuba.studio.panel import AXES, Panel
-from fd_mitsuba.studio.results import download, shown_key, shown_part
+from fd_mitsuba.studio.results import download, shown_key, shown_part, whole_result
 
 if TYPE_CHECKING:
     import viser
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from fd_mitsuba.studio.session import Session
 
 _NOTE_SECONDS = 8.0
+_BETWEEN = 0.4
+"""Room between two results that are compared, canonical units."""
 
 
 class View:
@@ -27,18 +29,21 @@ class View:
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self.server, self.session = server, session
         self._lock = session.lock  # one for both: whoever tells and whoever shows cannot wait for each other
-        self._part_key = ""
+        self._part_key = self._beside_key = ""
         self._whole = False
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
         actions: dict[str, Callable[[Any], object]] = {
             "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]),
             "pick": self._pick,
             "add": lambda event: session.add(),
+            "undo": lambda event: session.undo(),
+            "redo": lambda event: session.redo(),
             "remove": lambda event: session.remove(session.state.selected),
             "grow": lambda event: self._grow(session.grow),
             "another_seed": lambda event: self._grow(session.another_seed),
             "save": lambda event: self._note(event, session.save_scene()),
             "show": lambda event: session.show(self.panel.run_of(event.target.value)),
+            "compare": lambda event: session.compare(self.panel.run_of(event.target.value)),
             "stop": lambda event: session.queue.stop(session.shown),
             "resume": lambda event: session.queue.resume(session.shown),
             "download": self._download,
@@ -68,6 +73,7 @@ class View:
         if topic == "scene":
             canvas.show_no_part()
             self._part_key = ""
+            self._show_beside()
             canvas.show_base(state.glb, frame, state.base)
         if topic in ("scene", "regions"):
             canvas.show_regions(poses, meshes, frame)
@@ -89,6 +95,17 @@ class View:
         if topic in ("scene", "runs"):
             panel.show_runs()
             self._show_part()
+            self._show_beside()
+
+    def _show_beside(self) -> None:
+        run = self.session.queue.runs.get(self.session.beside)
+        key = "" if run is None else run.name
+        if key == self._beside_key:
+            return
+        self._beside_key = key
+        state = self.session.state
+        width = float(np.ptp(state.base.vertices[:, 0])) + _BETWEEN
+        self.canvas.show_beside(None if run is None else whole_result(run), state.regions.frame, width)
 
     def _show_part(self) -> None:
         run = self.session.queue.runs.get(self.session.shown)
