@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 
+from fd_mitsuba.backend.collector import uncollected
 from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import chosen_settings, load, scene_options, settings_options
 from fd_mitsuba.errors import UserError
@@ -20,18 +20,8 @@ def add_check_command(commands: argparse._SubParsersAction) -> None:
     check.set_defaults(call=_check)
 
 
+@uncollected()  # most of a check is imports
 def _check(options: argparse.Namespace) -> int:
-    # Most of a check is imports, whose many objects all stay: looking for garbage among them is a tenth of the time.
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        return _checked(options)
-    finally:
-        if collects:
-            gc.enable()
-
-
-def _checked(options: argparse.Namespace) -> int:
     settings = chosen_settings(options)
     scene = load(options, config=settings.config)
     from fd_mitsuba.runs.check import check_scene

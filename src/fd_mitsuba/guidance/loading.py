@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from fd_mitsuba.backend.collector import uncollected
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
@@ -148,9 +149,12 @@ def _load(
     conventions: ModelConventions,
     device: str,
 ) -> Components:
-    import diffusers
-    import transformers
+    with uncollected():  # what these name is imported when it is asked for
+        import diffusers
+        import transformers
 
+        unet_class, text_class = diffusers.UNet2DConditionModel, transformers.CLIPTextModel
+        vae_class = getattr(diffusers, index["vae"][1])
     dtype = getattr(torch, config.dtype)
     on_cpu = torch.device(device).type == "cpu"
     scheduler_class = getattr(diffusers, index["scheduler"][1], None)
@@ -160,9 +164,9 @@ def _load(
         )
     loaded: dict[str, Any] = {}
     wanted: tuple[tuple[str, Any, torch.dtype], ...] = (
-        ("unet", diffusers.UNet2DConditionModel, dtype),
-        ("vae", getattr(diffusers, index["vae"][1]), torch.float32),
-        ("text_encoder", transformers.CLIPTextModel, dtype if on_cpu else torch.float32),
+        ("unet", unet_class, dtype),
+        ("vae", vae_class, torch.float32),
+        ("text_encoder", text_class, dtype if on_cpu else torch.float32),
     )
     for part, network_class, kind in wanted:
         owner: Any = network_class

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from fd_mitsuba.backend.collector import long_lived
 from fd_mitsuba.backend.peak_memory import peak_memory_mb
 from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import rendering_threads
@@ -111,7 +113,7 @@ def run(
             first checkpoint leaves no folder behind.
     """
     refuse_strange_folder(folder)
-    with run_lock(folder, say):
+    with run_lock(folder, say), ExitStack() as until_done:
         started = time.monotonic()
         config = checked_choices(config)
         refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
@@ -140,6 +142,7 @@ def run(
 
         for own in (for_geometry, for_appearance):
             refuse_guidance_alone(own)
+        until_done.enter_context(long_lived())
 
         def begin() -> None:
             for line in (*opening, *scene.warnings):
