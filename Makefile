@@ -2,6 +2,7 @@
 #   make demo                              grow the demo's part (CONFIG=, SCENE=, OUT= change what)
 #   make test                              all fast tests (minutes); PYTEST_ARGS="-k union -x" narrows them down
 #   make fuzz N=5000 SEED=1           spoiled inputs, and a table of how the command line takes them
+#   make mutants                           how many small faults the tests find, an hour (MUTANTS="--sample 60")
 #   make docs                              the documentation site, into build/site
 #   make wheel                             builds the wheel and tries it outside the repository
 #   make types                             the type checker, a minute
@@ -15,12 +16,13 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
 PYTEST_ARGS ?=
 N ?= 500
+MUTANTS ?=
 SEED ?= 0
 
 PY := .venv/bin/python
 STAMP := .venv/.installed
 
-.PHONY: demo test fuzz docs wheel bench lint types clean install llvm
+.PHONY: demo test fuzz mutants docs wheel bench lint types clean install llvm
 .DEFAULT_GOAL := demo
 
 install: $(STAMP)
@@ -42,6 +44,9 @@ test: $(STAMP) llvm
 
 fuzz: $(STAMP) llvm
 	$(PY) tests/fuzz/fuzzer.py -n $(N) --seed $(SEED) --workers 2 --refusals vague
+
+mutants: $(STAMP) llvm
+	$(PY) tests/mutation/mutate.py $(MUTANTS)
 
 bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json

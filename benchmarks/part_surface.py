@@ -29,7 +29,6 @@ import numpy as np  # noqa: E402
 from fd_mitsuba.evaluation.joint import measure_joint  # noqa: E402
 from fd_mitsuba.export.bake.chart_notches import charts_of  # noqa: E402
 from fd_mitsuba.export.bake.shading_noise import surface_noise  # noqa: E402
-from fd_mitsuba.export.bake.tangents import vertex_normals  # noqa: E402
 from fd_mitsuba.export.bake.unwrap import unwrap  # noqa: E402
 from fd_mitsuba.export.final_surface.final_part import final_part, part_function  # noqa: E402
 from fd_mitsuba.export.final_surface.projection import project  # noqa: E402
@@ -39,6 +38,7 @@ from fd_mitsuba.export.solid.solid import Solid  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.mesh_distance import MeshDistance  # noqa: E402
+from fd_mitsuba.scene.vertex_normals import vertex_normals  # noqa: E402
 
 _POINTS, _VOLUME_POINTS = 20_000, 300_000
 

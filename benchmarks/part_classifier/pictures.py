@@ -9,7 +9,8 @@ import numpy as np
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
 from fd_mitsuba.prior.data.catalogue import COARSE, Catalogue
 from fd_mitsuba.prior.data.primitives import Solid, ellipsoid, join, rotation
-from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, closeup_camera, shade, vertex_normals
+from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, closeup_camera, shade
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 SEEN_SEED = 2**33
 """Training draws from here on, far from the prior's seeds (below 2**31), its evaluation's and the CLIP evaluator's."""
@@ -116,7 +117,7 @@ class _Warp:
     def __call__(self, solid: Solid) -> Solid:
         points = solid.vertices @ self._linear.T
         points = points + np.sin(points @ self._waves + self._phases) @ self._shifts
-        points = points + self._inflate * vertex_normals(points, solid.faces)
+        points = points + self._inflate * vertex_normals(points, solid.faces, weights="area")
         return Solid((points - self._centre) * self._scale, solid.faces)
 
 
@@ -128,7 +129,7 @@ def _distorted(part: Solid, rng: np.random.Generator) -> Solid:
     points = (part.vertices - middle) @ linear.T
     waves = rng.normal(size=(3, 3)) * (4.0 / size)
     points += np.sin(points @ waves + rng.uniform(0, 6, 3)) @ rng.normal(size=(3, 3)) * (size * rng.uniform(0, 0.02))
-    points += rng.uniform(-0.01, 0.02) * vertex_normals(points, part.faces)
+    points += rng.uniform(-0.01, 0.02) * vertex_normals(points, part.faces, weights="area")
     return Solid(points + middle + rng.normal(size=3) * 0.015, part.faces)
 
 

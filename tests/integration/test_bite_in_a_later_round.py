@@ -8,7 +8,7 @@ import numpy as np
 import pygltflib
 import pytest
 import trimesh
-from test_two_rounds import SMALL, first, of_part  # noqa: F401
+from test_two_rounds import first, of_part  # noqa: F401
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.runs.parts import list_parts
@@ -34,7 +34,7 @@ def test_a_bite(
     regions.write_text(BITE.format(size=0.12, y=y, z=z))
     scene = load_edit_scene(first / "mitsuba" / "scene.xml", regions=regions, prompt="a pig with a bite")
     assert scene.subtracts and [part.name for part in scene.earlier] == ["wings"]
-    config = RunConfig.load(None, [*SMALL, "geometry.steps=1"])
+    config = RunConfig.load(first.parent / "tiny.toml", ["geometry.steps=1"])
     metrics = run(scene, config, folder, quiet=True, say=lambda line: None, stages=("geometry",))
     assert metrics["base_identical"] and metrics["removed_volume"] > 0 and metrics["volume_change_error"] < 1e-3
     export_run(folder, ("glb", "ply", "mitsuba"), 64, say=lambda line: None)

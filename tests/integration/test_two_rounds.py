@@ -12,7 +12,8 @@ import numpy as np
 import pygltflib
 import pytest
 import torch
-from conftest import BASE, INTEGRATOR, LIGHT, PART, REGION, write_ply
+from conftest import REGION
+from tiny_runs import run_words, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
@@ -30,7 +31,23 @@ HORN = """<shape type="focal_region" id="horn">{name}<transform name="to_world">
   <scale x="$thin" y="0.15" z="0.06"/><translate x="0" y="0.5" z="0.55"/></transform></shape>"""
 PROMPT = "a pig with wings and a horn"
 GOLD = '<bsdf type="roughconductor" id="part"><string name="material" value="Au"/></bsdf>'
-SMALL = ["geometry.grid_resolution=20", "geometry.lambda_sds=0"]
+SETTINGS = """
+[geometry]
+grid_resolution = 20
+lambda_sds = 0.0
+steps = 2
+[appearance]
+steps = 2
+lambda_sds = 0.0
+views = 1
+spp = 1
+picture_size = 16
+[output]
+texture_size = 64
+turntable_frames = 2
+turntable_size = 16
+picture_size = 0
+"""
 
 
 class Learned:
@@ -53,10 +70,7 @@ def regions(folder: Path, *more: str, name: str = '<string name="part" value="ho
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np.ndarray]) -> Path:
     """The export folder of a first round: a pig with textured wings."""
-    root = tmp_path_factory.mktemp("first")
-    write_ply(root / "animal.ply", *animal)
-    pieces = ['<scene version="3.0.0">', INTEGRATOR, LIGHT, BASE, PART, WINGS, "</scene>"]
-    (root / "scene.xml").write_text("\n".join(pieces))
+    root = write_place(tmp_path_factory.mktemp("first"), animal, SETTINGS, region=WINGS)
     scene = load_edit_scene(root / "scene.xml")
     vertices, faces = unit_sphere(3)
     centre = scene.frame.to_user(scene.regions[0].centre)
@@ -73,7 +87,7 @@ def again(first: Path, folder: Path, **options: str) -> EditScene:
 def second(first: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a second round; its part is still the region."""
     root = tmp_path_factory.mktemp("second")
-    scene, config, folder = again(first, root), RunConfig.load(None, SMALL), root / "run"
+    scene, config, folder = again(first, root), RunConfig.load(first.parent / "tiny.toml"), root / "run"
     describe_run(scene, config, folder, "fd_mitsuba run")
     stage = GeometryStage(scene, config, None)
     header = CheckpointHeader(stage.name, 2, config.content_hash(stage.name), counters=dict(stage.counters))
@@ -265,15 +279,11 @@ def test_bad_records_and_folders_are_one_line(first: Path, tmp_path: Path, capfd
 @pytest.mark.timeout(600)
 def test_two_whole_rounds(first: Path, tmp_path: Path) -> None:
     """Both stages of both rounds, with no guidance and two steps each."""
-    sizes = ["geometry.steps=2", "appearance.steps=2", "appearance.lambda_sds=0", "appearance.views=1"]
-    sizes += ["appearance.spp=1", "appearance.picture_size=16", "output.texture_size=64"]
-    sizes += ["output.turntable_frames=2", "output.turntable_size=16", "output.picture_size=0"]
-    settings = [word for item in SMALL + sizes for word in ("--set", item)]
-    scenes = [first.parent / "scene.xml", tmp_path / "one" / "export" / "mitsuba" / "scene.xml"]
+    place, one, two = first.parent, tmp_path / "one", tmp_path / "two"
+    assert main(run_words(place, str(one))) == 0
     more = ["--regions", str(regions(tmp_path)), "--prompt", PROMPT]
-    assert main(["run", str(scenes[0]), *settings, "-q", "-o", str(tmp_path / "one")]) == 0
-    assert main(["run", str(scenes[1]), *settings, *more, "-q", "-o", str(tmp_path / "two")]) == 0
-    before = of_part(tmp_path / "one" / "export" / "mitsuba", "wings")
-    assert len(before) >= 4 and before == of_part(tmp_path / "two" / "export" / "mitsuba", "wings")
-    file = pygltflib.GLTF2().load(tmp_path / "two" / "export" / "asset.glb")
+    assert main(run_words(place, str(two), *more, scene=one / "export" / "mitsuba" / "scene.xml")) == 0
+    before = of_part(one / "export" / "mitsuba", "wings")
+    assert len(before) >= 4 and before == of_part(two / "export" / "mitsuba", "wings")
+    file = pygltflib.GLTF2().load(two / "export" / "asset.glb")
     assert [item.name for item in file.nodes] == ["base", "part_wings", "part_horn"]

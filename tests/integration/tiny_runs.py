@@ -51,10 +51,16 @@ def write_place(
     return root
 
 
-def run_words(place: Path, output: str, *more: str) -> list[str]:
-    """The command line's words for a run of the place's scene with one thread into its folder `output`."""
-    words = ["run", place / "scene.xml", "-c", place / "tiny.toml", "-o", place / output, "-t", "1", "-q", *more]
-    return [str(word) for word in words]
+def run_words(place: Path, output: str, *more: str, scene: Path | None = None) -> list[str]:
+    """The command line's words for a run of the place's scene with one thread into its folder `output`.
+
+    Args:
+        place: of `write_place`.
+        output: below it, or absolute.
+        scene: another one, with the settings of the place.
+    """
+    files = ["run", scene or place / "scene.xml", "-c", place / "tiny.toml", "-o", place / output]
+    return [str(word) for word in (*files, "-t", "1", "-q", *more)]
 
 
 def start_words(words: list[str], **environment: str) -> subprocess.Popen[str]:

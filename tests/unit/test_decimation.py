@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from fd_mitsuba.export.bake.tangents import vertex_normals
 from fd_mitsuba.export.final_surface.final_part import FinalPart
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.runs.pipeline import _within_budget
 from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 
 def ball(scale: tuple[float, float, float] = (0.25, 0.25, 0.25), level: int = 4) -> Solid:

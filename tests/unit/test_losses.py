@@ -59,6 +59,7 @@ def test_presence_by_hand():
     # First region: its two highest are -0.1 and -0.2; second: 0.5 and 0.3, deep enough; third: without points.
     assert loss_presence(sdf, members, 0.5, 0.02).item() == pytest.approx((0.02 + 0.15) / 2)
     assert loss_presence(sdf, members[2:], 0.5, 0.02).item() == 0
+    assert loss_presence(torch.zeros(6), members[2:], 0.5, 0.02).item() == 0
 
 
 def test_presence_lifts_the_deepest_points_of_an_empty_region_and_nothing_else():

@@ -7,7 +7,14 @@ import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from fd_mitsuba.extraction.marching_tets import crossing_faces, crossing_faces_plain, crossing_fraction, edge_ends
+from fd_mitsuba.extraction.marching_tets import (
+    away_from_crossings,
+    crossing_faces,
+    crossing_faces_plain,
+    crossing_fraction,
+    edge_ends,
+    true_positions,
+)
 from fd_mitsuba.extraction.tet_grid import TetGrid
 
 
@@ -147,3 +154,38 @@ def test_gradients_of_a_flat_field_are_bounded():
     limit = 1 / (0.02 * 0.03) * 1.001
     assert torch.isfinite(fraction).all() and ((fraction > 0) & (fraction < 1)).all()
     assert inside.grad.abs().max() <= limit and outside.grad.abs().max() <= limit
+
+
+def test_the_fraction_by_hand():
+    """Linear, squeezed by a thousandth at both ends; a difference below 0.02 spacing is widened to that, evenly."""
+    inside, outside = torch.tensor([0.3, 1e-4, 0.0015]), torch.tensor([-0.1, -2e-4, -0.0005])
+    expected = torch.tensor([0.75, (1e-4 + 0.5 * 1.7e-3) / 2e-3, 0.75])
+    torch.testing.assert_close(crossing_fraction(inside, outside, 0.1), 0.001 + 0.998 * expected)
+
+
+def test_faces_do_not_depend_on_what_the_lookup_held():
+    grid = TetGrid(6)
+    inside = (torch.rand(grid.count, generator=torch.Generator().manual_seed(3)) < 0.5).view((grid.side,) * 3)
+    lookup = torch.full((8 * grid.count,), 12345, dtype=torch.int32)
+    for one, other in zip(crossing_faces(inside), crossing_faces(inside, lookup=lookup), strict=True):
+        assert torch.equal(one, other)
+    assert lookup[crossing_faces(inside)[0]].tolist() == list(range(len(crossing_faces(inside)[0])))
+
+
+def test_positions_and_types_of_what_comes_back():
+    marks = torch.tensor([[False, True, True], [True, False, False]])
+    assert true_positions(marks).equal(torch.tensor([1, 2, 3]))
+    edges, faces = crossing_faces(torch.arange(27).view(3, 3, 3) == 13)
+    assert edges.dtype == faces.dtype == torch.int64 and edges.equal(edges.sort().values)
+    # Kuhn's cut of eight cubes: 14 edges at the vertex that they share, and 24 of their tetrahedra.
+    assert len(edges) == 14 and faces.shape == (24, 3)
+
+
+def test_what_lies_away_from_crossings_one_vertex_after_another():
+    values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1)) - 0.12
+    values[0, 0, 0] = 0.0  # counts as outside
+    away = away_from_crossings(values)
+    for place in np.ndindex(*values.shape):
+        around = values[tuple(slice(max(index - 1, 0), index + 2) for index in place)] > 0
+        assert away[place] == (around.all() or not around.any())
+    assert away.any() and not away.all()

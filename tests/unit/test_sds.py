@@ -134,6 +134,44 @@ def test_timesteps_fill_their_range_evenly() -> None:
     assert counts.tolist() == pytest.approx([83 / 331] * 4, abs=0.015)
 
 
+def test_each_timestep_of_a_narrow_range_is_as_likely_as_the_others() -> None:
+    # Fractions .3 and .5 of the last timestep, 10; of no fraction at all, what is below the first goes to the first.
+    generator = torch.Generator().manual_seed(0)
+    drawn = sds.draw_timesteps((0.3, 0.5), 11, 30_000, generator)
+    assert torch.bincount(drawn, minlength=6).tolist() == pytest.approx([0, 0, 0, 10_000, 10_000, 10_000], abs=400)
+    first = sds.draw_timesteps((0.0, 1.0), 4, 30_000, generator)
+    assert torch.bincount(first, minlength=4).tolist() == pytest.approx([0, 15_000, 7_500, 7_500], abs=400)
+
+
+@pytest.mark.parametrize("annealing", ["linear", "sqrt"])
+def test_a_schedule_runs_from_the_noisy_end_to_the_other(annealing: str) -> None:
+    power = {"linear": 1, "sqrt": 0.5}[annealing]
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        due = sds.scheduled_timesteps((0.1, 0.9), 1001, 3, annealing, progress)
+        assert due.dtype == torch.int64 and due.tolist() == 3 * [round(900 - 800 * progress**power)]
+    assert sds.scheduled_timesteps((0.0, 1.0), 50, 1, annealing, 1.0).tolist() == [1]
+    assert sds.scheduled_timesteps((0.0, 1.0), 50, 1, annealing, 0.0).tolist() == [49]
+
+
+def test_levels_keep_the_type_that_they_need() -> None:
+    plain = torch.tensor([0.9, 0.5], dtype=torch.float64)
+    assert sds.levels(plain).dtype == torch.float32 and sds.levels(plain).tolist() == pytest.approx([0.9, 0.5])
+    ending = sds.levels(torch.tensor([0.9, 0.0]))
+    assert ending.dtype == torch.float64 and 0 < ending[1] < 1e-9 and ending[0] == pytest.approx(0.9)
+
+
+def test_the_perpendicular_part_of_each_sample() -> None:
+    """Sample by sample: orthogonal to its own direction, and what is taken away is parallel to that."""
+    generator = torch.Generator().manual_seed(7)
+    other, direction = torch.randn(2, 2, 3, 4, 5, generator=generator, dtype=torch.float64)
+    found = sds.perpendicular(other, direction)
+    for sample in range(2):
+        flat, along = (values[sample].flatten() for values in (other, direction))
+        expected = flat - (flat @ along) / (along @ along) * along
+        torch.testing.assert_close(found[sample].flatten(), expected)
+    assert sds.perpendicular(other, torch.zeros_like(direction)).equal(other)
+
+
 def test_timesteps_repeat_with_the_generator_and_stay_in_bounds() -> None:
     first, second = (sds.draw_timesteps((0.0, 1.0), 50, 500, torch.Generator().manual_seed(seed)) for seed in (5, 5))
     assert first.equal(second)
@@ -144,6 +182,9 @@ def test_timesteps_repeat_with_the_generator_and_stay_in_bounds() -> None:
 def test_normalised_gradient_has_mean_size_one() -> None:
     assert sds.normalising_scale(latents(1.0, -3.0)) == 0.5
     assert math.isfinite(sds.normalising_scale(latents(0.0, 0.0)))
+    two = torch.tensor([[[[1.0, -8.0]], [[3.0, 100.0]]]])
+    assert sds.normalising_scale(two, torch.tensor([[[[1.0, 0.0]]]])) == 0.5
+    assert sds.normalising_scale(two, torch.zeros(1, 1, 1, 2)) == 1
 
 
 def test_carried_gradient_is_exact_however_small() -> None:

@@ -8,11 +8,11 @@ from test_remesh import ball, cube, marched, remeshed
 
 from fd_mitsuba.evaluation.joint import joint_curves, measure_joint
 from fd_mitsuba.export.bake.shading_noise import surface_noise, widened_roughness
-from fd_mitsuba.export.bake.tangents import vertex_normals
 from fd_mitsuba.export.final_surface.shading import smooth_normals
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 CELL = 2 / 64
 BOX = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],

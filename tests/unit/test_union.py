@@ -42,6 +42,8 @@ def test_only_outside_blends_only_where_both_are_negative():
     outside = plain < 0
     assert torch.equal(union[~outside], plain[~outside])
     assert torch.equal(union[outside], soft_union(base, part, 0.15)[outside])
+    surface, below = torch.zeros(1), torch.tensor([-0.01])  # neither solid's surface moves
+    assert soft_union(surface, below, 0.15, only_outside=True).item() == 0
 
 
 @pytest.mark.parametrize("only_outside", [False, True])

@@ -7,9 +7,10 @@ import pytest
 from scipy.ndimage import binary_dilation, label
 
 from fd_mitsuba.export.bake.atlas_raster import rasterise, weights_at
-from fd_mitsuba.export.bake.tangents import vertex_normals, vertex_tangents
+from fd_mitsuba.export.bake.tangents import vertex_tangents
 from fd_mitsuba.export.bake.unwrap import padding_for, unwrap
 from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 SIZE = 256
 

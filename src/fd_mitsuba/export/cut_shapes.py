@@ -25,6 +25,7 @@ from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 
 @dataclass(frozen=True)
@@ -154,9 +155,6 @@ def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:
     used, kept = np.unique(cut.faces[~own], return_inverse=True)
     corners = cut.vertices[cut.faces[own]]
     rows = [corners.reshape(-1, 3)]
-    vertex_of = np.unique(rows[0], axis=0, return_inverse=True)[1].reshape(-1)
-    area = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
-    whole = np.stack([np.bincount(vertex_of, weights=area[:, axis]) for axis in range(3)], axis=1)
     face, weights = MeshDistance(shape.vertices, shape.faces).nearest(corners.mean(axis=1))
     start, made = 0, {}
     for key in ("normals", "uv", "colours"):
@@ -168,7 +166,8 @@ def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:
         if key == "normals":
             new = used >= len(shape.vertices)
             ours[new] = _unit(ours[new])
-            added = _unit(whole[vertex_of])
+            loose = np.arange(len(rows[0])).reshape(-1, 3)
+            added = vertex_normals(rows[0], loose, welded=True).astype(np.float32)
         else:
             added = np.repeat(np.einsum("ij,ijk->ik", weights, values[shape.faces[face]]), 3, axis=0)
         rows.append(added)

@@ -56,7 +56,7 @@ def draw_timesteps(
     low, high = (round(bound * (train_timesteps - 1)) for bound in bounds)
     draw = torch.rand(count, generator=generator, dtype=torch.float64)
     timesteps = (low + draw * (high - low + 1)).floor().long().clamp(max=high)
-    return timesteps.clamp(1, train_timesteps - 1)
+    return timesteps.clamp(min=1)
 
 
 def scheduled_timesteps(
@@ -72,7 +72,7 @@ def scheduled_timesteps(
     low, high = (bound * (train_timesteps - 1) for bound in bounds)
     share = progress if annealing == "linear" else progress**0.5
     due = round(high - (high - low) * share)
-    return torch.full((count,), min(max(due, 1), train_timesteps - 1))
+    return torch.full((count,), max(due, 1))
 
 
 def add_noise(z: Latents, noise: Latents, alpha_bar: PerLatent) -> Latents:

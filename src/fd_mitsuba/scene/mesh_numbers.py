@@ -20,7 +20,7 @@ import numpy as np
 
 from fd_mitsuba.backend.startup import FACES, NORMALS, UVS, VERTICES
 from fd_mitsuba.scene.ply_header import read_ply_header
-from fd_mitsuba.scene.vertex_averages import face_normals_at_vertices, vertices_with_area
+from fd_mitsuba.scene.vertex_normals import vertex_normals, vertices_with_area
 
 if TYPE_CHECKING:
     from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
@@ -109,11 +109,10 @@ def _correct_normals(parameters: Any, name: str) -> list[str]:
         return []
     vertices = np.array(parameters[VERTICES], dtype=np.float64).reshape(-1, 3)
     faces = np.array(parameters[FACES]).astype(np.int64).reshape(-1, 3)
-    around = face_normals_at_vertices(vertices, faces)
+    around = vertex_normals(vertices, faces, welded=True)
     # They may all point inwards, as `flip_normals` wants them: the others tell.
     if np.einsum("ij,ij->", normals[~broken], around[~broken]) < 0:
         around = -around
-    around[np.linalg.norm(around, axis=1) < 0.5] = [0.0, 0.0, 1.0]
     parameters[NORMALS] = np.where(broken[:, None], around, normals).astype(np.float32).ravel()
     parameters.update()
     seen = int(broken[vertices_with_area(vertices, faces)].sum())  # elsewhere nothing is ever shaded

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.spatial import KDTree
 
-from fd_mitsuba.export.bake.tangents import vertex_normals
+from fd_mitsuba.scene.vertex_normals import angles_between, vertex_normals
 
 _SAMPLES = 40_000
 _SMOOTHED_OVER = 0.02
@@ -50,7 +50,7 @@ def surface_noise(
     radius = smoothed_over * float(np.ptp(vertices, axis=0).max())
     pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     pairs = pairs[np.einsum("ij,ij->i", shading[pairs[:, 0]], shading[pairs[:, 1]]) > 0]
-    return float(np.degrees(_angle(shading, _fitted(points, shading, pairs, radius))).mean())
+    return float(np.degrees(angles_between(shading, _fitted(points, shading, pairs, radius))).mean())
 
 
 def _fitted(points: np.ndarray, values: np.ndarray, pairs: np.ndarray, radius: float) -> np.ndarray:
@@ -83,7 +83,3 @@ def _spread(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, seed: 
     shading = (weights * normals[faces[chosen]]).sum(axis=1)
     length = np.linalg.norm(shading, axis=1, keepdims=True)
     return (weights * corners[chosen]).sum(axis=1), shading / np.maximum(length, 1e-12)
-
-
-def _angle(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.einsum("ij,ij->i", one, other))

@@ -22,8 +22,8 @@ from fd_mitsuba.export.bake.chart_growth import grown_charts, split_chart
 from fd_mitsuba.export.bake.chart_notches import charts_of, crowded, open_notches
 from fd_mitsuba.export.bake.chart_packing import packed_charts
 from fd_mitsuba.export.bake.flatten import flattened
-from fd_mitsuba.export.bake.tangents import vertex_normals
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FACES_AT_ONCE = 2500
 """xatlas grows charts in more than linear time: pieces of this size are quicker, and give fewer charts."""

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from fd_mitsuba.export.bake.tangents import vertex_normals
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
 from fd_mitsuba.export.final_surface.projection import project
@@ -32,6 +31,7 @@ from fd_mitsuba.export.solid.part_solid import LatticePart, lattice_part, part_s
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FINER = (2, 4)
 """How many times finer than the training's the lattice is: as its edges are to be, within these."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fd_mitsuba.export.bake.tangents import vertex_normals
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _WIDTH_CELLS = 0.26
 """Standard deviation of the average along the surface, in cells of the training; a cell of the field has two."""

@@ -16,6 +16,7 @@ from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.captions import caption, random_style, view_words
 from fd_mitsuba.prior.data.parts import PARTS, resized
 from fd_mitsuba.prior.data.primitives import Solid, transform
+from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 VIEW_SIZE = 32
 SUPERSAMPLING = 2
@@ -65,7 +66,8 @@ class RayCaster:
         params = mi.traverse(mesh)
         params["vertex_positions"] = vertices.ravel()
         params["faces"] = faces.ravel()
-        params["vertex_normals"] = vertex_normals(vertices, faces).ravel()
+        normals = vertex_normals(vertices, faces, weights="area")  # as the geometry pass shows it
+        params["vertex_normals"] = normals.astype(np.float32).ravel()
         params.update()
         self._scene = mi.load_dict({"type": "scene", "solid": mesh})
 
@@ -83,14 +85,6 @@ class RayCaster:
         )
         hit = self._scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
         return np.array(hit.t), np.array(hit.sh_frame.n).T, np.array(hit.prim_index)
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals (V, 3)."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face = np.cross(b - a, c - a)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(face[:, i], 3), len(vertices)) for i in range(3)], 1)
-    return (total / (np.linalg.norm(total, axis=1, keepdims=True) + 1e-20)).astype(np.float32)
 
 
 @dataclass(frozen=True)
