@@ -22,7 +22,7 @@ from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 
-IMAGE_EDITORS: dict[str, str] = {}
+IMAGE_EDITORS = {"pix2pix_2d": "InstructPix2Pix, view by view", "inpaint_2d": "inpainting, view by view"}
 """Methods that edit single images, and what they are called in their figure."""
 
 
