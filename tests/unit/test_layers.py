@@ -13,7 +13,7 @@ import fd_mitsuba
 ROOT = Path(fd_mitsuba.__file__).parent
 LAYERS = (
     "conventions errors io config backend scene assets fields extraction render losses guidance viewing training "
-    "export runs batch evaluation prior api studio cli __main__"
+    "export runs batch evaluation baselines prior api studio cli __main__"
 ).split()
 """Packages and modules of the root; batch stands above evaluation, because ablations and tables of many scenes run
 through it."""

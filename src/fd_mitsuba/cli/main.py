@@ -20,6 +20,7 @@ from fd_mitsuba.backend.processes import leave_the_word_to_the_first, speaks_fir
 from fd_mitsuba.cli.ablate import add_ablate_commands
 from fd_mitsuba.cli.batch import add_batch_commands
 from fd_mitsuba.cli.check import add_check_command
+from fd_mitsuba.cli.compare import add_compare_command
 from fd_mitsuba.cli.completion import add_completion_option
 from fd_mitsuba.cli.demo import add_demo_command
 from fd_mitsuba.cli.doctor import add_doctor_command
@@ -128,6 +129,7 @@ def command_parser() -> argparse.ArgumentParser:
         add_report_commands,
         add_evaluate_commands,
         add_ablate_commands,
+        add_compare_command,
         add_names_command,
         add_doctor_command,
         add_prior_commands,

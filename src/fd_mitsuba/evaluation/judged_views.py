@@ -108,7 +108,7 @@ def shape_views(stage: GeometryStage, count: int, size: int, spp: int, kind: Kin
     shown = _shapes(stage, cameras, size, spp)
     edited, base = shown["edited"], shown["base"]
     whole = (edited[:, 3:4] > 0.999) & (base[:, 3:4] > 0.999) & (edited[:, 4:5] == 0)
-    colours = {name: _coloured(picture, kind) for name, picture in shown.items()}
+    colours = {name: coloured(picture, kind) for name, picture in shown.items()}
     return JudgedViews(kind, cameras.azimuth_deg, **colours, base_pixels=whole, untouched=whole)
 
 
@@ -116,7 +116,7 @@ def shape_views(stage: GeometryStage, count: int, size: int, spp: int, kind: Kin
 def shape_pictures(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int, kind: Kind) -> ShapePictures:
     """The same from other cameras, for judges alone."""
     shown = _shapes(stage, cameras, size, spp)
-    colours = {name: _coloured(picture, kind) for name, picture in shown.items()}
+    colours = {name: coloured(picture, kind) for name, picture in shown.items()}
     return ShapePictures(**colours, part_pixels=shown["edited"][:, 4].sum((1, 2)))
 
 
@@ -130,7 +130,8 @@ def _shapes(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int) -> 
     return {"edited": edited, "base": base, "start": start}
 
 
-def _coloured(pictures: Tensor, kind: Kind) -> Tensor:
+def coloured(pictures: Tensor, kind: Kind) -> Tensor:
+    """(N, 3, S, S) in [0, 1] of geometry pictures (N, >= 4, S, S): `normals` as colours, or `shaded` grey."""
     normal, mask = pictures[:, :3], pictures[:, 3:4]
     if kind == "normals":
         return ((normal + mask) / 2).clamp(0, 1)

@@ -111,7 +111,7 @@ def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     picture = None
     if asks_for_image_prompt(config):
         names = ("vae", "text_encoder", "tokenizer", "unet", "scheduler")
-        with _quiet():
+        with quiet_loading():
             picture = add_image_prompt(config, {name: getattr(loaded, name) for name in names})
     return replace(loaded, words=dict(words), image_prompt=picture)
 
@@ -173,7 +173,7 @@ def _load(
         key = "torch_dtype" if part != "text_encoder" else "dtype"
         model = _network(owner, folder / part, variants[part], **{key: kind})
         loaded[part] = model.to("cpu" if part == "text_encoder" else device)
-    with _one_line(folder / "tokenizer"), _quiet():
+    with _one_line(folder / "tokenizer"), quiet_loading():
         # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
         owner = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
@@ -183,7 +183,7 @@ def _load(
         raise UserError(
             f"{folder / 'tokenizer'}: has {len(tokenizer)} words, the text encoder knows {known}; fetch the model again"
         )
-    with _one_line(folder / "scheduler"), _quiet():
+    with _one_line(folder / "scheduler"), quiet_loading():
         scheduler = scheduler_class.from_pretrained(str(folder / "scheduler"), local_files_only=True)
     if not hasattr(scheduler, "alphas_cumprod"):
         raise UserError(f"{folder / 'scheduler'}: {index['scheduler'][1]} has no noise levels alphas_cumprod; {LAYOUT}")
@@ -198,7 +198,7 @@ def _load_controlnet(folder: Path, variant: str | None, config: GuidanceConfig, 
 
 
 def _network(owner: Any, folder: Path, variant: str | None, **kind: torch.dtype) -> torch.nn.Module:
-    with _one_line(folder), _quiet():
+    with _one_line(folder), quiet_loading():
         model, info = owner.from_pretrained(
             str(folder),
             variant=variant,
@@ -227,7 +227,7 @@ def _one_line(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet_loading() -> Iterator[None]:
     """No progress bars and remarks of the libraries while a component loads; what matters is checked here."""
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from fd_mitsuba.config import RunConfig, Section
@@ -46,14 +46,17 @@ def checked_choices(config: RunConfig) -> RunConfig:
     return config.model_copy(update=changed)
 
 
-def described() -> dict[str, dict[str, dict[str, Any]]]:
+def described(more: Sequence[Registry[Any]] = ()) -> dict[str, dict[str, dict[str, Any]]]:
     """Kind -> name -> `about`, a line, and `settings`, its own with their defaults.
+
+    Args:
+        more: registries of packages that are built on this one.
 
     Raises:
         UserError: the package of an entry point cannot be loaded.
     """
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    for registry in REGISTRIES:
+    for registry in (*REGISTRIES, *more):
         entries = (registry.entry(name, registry.label) for name in registry.names())
         found[registry.kind] = {
             entry.name: {

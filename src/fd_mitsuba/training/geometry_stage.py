@@ -24,7 +24,7 @@ from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.fields.varied_start import varied_start
-from fd_mitsuba.guidance.interface import Guidance, GuidanceViews, Phase
+from fd_mitsuba.guidance.interface import Guidance, GuidanceResult, GuidanceViews, Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
@@ -150,12 +150,7 @@ class GeometryStage:
             share = processes().share(len(cameras))
             cameras = cameras.some(share)
             pictures = self._render(surface, cameras, phase, step, share.start)
-            base = self._render_base(cameras, phase, step, share.start) if self.guidance.needs_base else None
-            regions = self._region_masks(cameras, step, share.start)
-            sides = cameras.azimuth_deg, cameras.elevation_deg
-            views = GuidanceViews(pictures, base, *sides, closeup, regions, share)
-            seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
-            result = self.guidance.guide(views, phase_step, phase_length, phase, seed)
+            result = self.ask(pictures, cameras, closeup, step, share)
             losses["sds"], preview = result.loss, result.preview
             values.update(processes().values_of_all(result.logs))
             self._watch_visibility(pictures)
@@ -166,6 +161,34 @@ class GeometryStage:
         values.update(descend(self.optimiser, losses, weights, step, remedy))
         values["part_faces"] = float(surface.face_is_part.sum())
         return StepRecord(values, partial(geometry_sheet, pictures.detach(), preview))
+
+    def ask(
+        self, pictures: Tensor, cameras: CameraBatch, closeup: bool, step: int, share: slice | None = None
+    ) -> GuidanceResult:
+        """What the guidance says of pictures (B, 5, H, H) of a step's views; gradients flow to them.
+
+        The pictures may be those of another representation of the scene, rendered from `self.cameras(step)` at the
+        size that the guidance wants: it is then guided as this stage is, with the same base, noise and timesteps.
+
+        Args:
+            share: which of the step's views these are, where several processes share them; None: they are all.
+        """
+        assert self.guidance is not None
+        phase, phase_step, phase_length = self.phase_of(step)
+        first = 0 if share is None else share.start
+        base = self._render_base(cameras, phase, step, first) if self.guidance.needs_base else None
+        regions = self._region_masks(cameras, step, first)
+        views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup, regions, share)
+        seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
+        return self.guidance.guide(views, phase_step, phase_length, phase, seed)
+
+    def new_pass(self, phase: Phase) -> GeometryPass:
+        """A render of the size and the samples that pictures of a phase have."""
+        geometry = self.config.geometry
+        size = self.guidance.picture_size(phase) if self.guidance is not None else 64
+        # A picture of the refined phase is averaged down by the encoder: one sample a pixel is plenty.
+        spp = geometry.spp if phase == "coarse" else 1
+        return GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
 
     def check_field(self, step: int) -> dict[str, float]:
         """The part's volume over the focal regions'; raises RunStopped for a field not finite, exploded or empty."""
@@ -211,12 +234,8 @@ class GeometryStage:
 
     def _pass(self, passes: dict[Phase, GeometryPass], phase: Phase) -> GeometryPass:
         if phase not in passes:
-            geometry = self.config.geometry
-            size = self.guidance.picture_size(phase) if self.guidance is not None else 64
-            # A picture of the refined phase is averaged down by the encoder: one sample a pixel is plenty.
-            spp = geometry.spp if phase == "coarse" else 1
             passes.clear()
-            passes[phase] = GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
+            passes[phase] = self.new_pass(phase)
         return passes[phase]
 
     def _extractor(self, active: GridVertices) -> SurfaceExtractor:

@@ -1,0 +1,97 @@
+"""Editing single views with the guidance model itself, where it knows shapes: the stand-in that needs no download.
+
+The built-in prior sees the base beside the noisy image, as InstructPix2Pix does, so that sampling it is editing. Each
+view is one image of the model's full size, not a part of a mosaic: nothing ties it to another view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from fd_mitsuba.baselines.image_editors.sampling import sample
+from fd_mitsuba.baselines.image_editors.views import EditedViews
+from fd_mitsuba.baselines.interface import EditedImages, EditTask, mesh_images
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
+from fd_mitsuba.guidance.interface import GuidanceViews
+from fd_mitsuba.runs.own_meshes import base_mesh
+from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.seeds import Purpose, seed_for
+
+VIEWS_AT_ONCE = 4
+
+
+class PriorEdit(EditedViews):
+    """Views edited by the guidance model.
+
+    Args:
+        task: whose guidance is a diffusion model that knows shapes.
+        steps: of DDIM.
+        guidance_scale, image_guidance_scale: see `sds.cfg_coefficients_with_image`.
+        repaints: only what the focal regions cover may change.
+        margin: cells around them that may change, too.
+    """
+
+    def __init__(
+        self,
+        task: EditTask,
+        steps: int,
+        guidance_scale: float,
+        image_guidance_scale: float,
+        repaints: bool = False,
+        margin: int = 0,
+    ) -> None:
+        super().__init__(task, steps)
+        guidance = task.guidance.inner
+        if not isinstance(guidance, DiffusionGuidance) or not guidance.conventions.is_packed:
+            raise UserError(
+                f"guidance.model = {task.config.guidance.source}: does not paint shapes by itself; name an image "
+                "editor by the method's setting model"
+            )
+        if not repaints and not guidance.has_image_pass:
+            raise UserError(
+                f"guidance.model = {task.config.guidance.source}: does not see the image that it is to edit (8 input "
+                "channels); name an image editor by the method's setting model"
+            )
+        self._guidance, self._repaints, self._margin = guidance, repaints, margin
+        scales = guidance_scale, image_guidance_scale
+        with_image = guidance.has_image_pass
+        self._coefficients = (
+            sds.cfg_coefficients_with_image(*scales) if with_image else sds.cfg_coefficients(guidance_scale)
+        )
+
+    def unedited(self, cameras: CameraBatch) -> EditedImages:
+        """The base's normals at the size of the latents."""
+        return mesh_images(base_mesh(self.scene), cameras, self._guidance.latent_size)
+
+    @torch.no_grad()
+    def edit(self, cameras: CameraBatch) -> EditedImages:
+        """Sampled latents, which are normals and coverage."""
+        guidance, base = self._guidance, self.unedited(cameras)
+        side, count = guidance.latent_size, len(cameras)
+        pictures = torch.cat([base.values, base.mask, base.mask], dim=1).to(guidance.device)
+        known = guidance.encode(pictures, "coarse")
+        generator = torch.Generator().manual_seed(seed_for(self.task.config.seed, Purpose.GUIDANCE))
+        noise = torch.randn(count, 4, side, side, generator=generator)
+        texts = guidance.embeddings(self._prompts(cameras), self._coefficients)
+        inside = self.region_mask(cameras, side, self._margin).to(guidance.device) if self._repaints else None
+        rows = []
+        for begin in range(0, count, VIEWS_AT_ONCE):
+            few = slice(begin, begin + VIEWS_AT_ONCE)
+            condition = guidance.seen_base(pictures[few], "coarse") if guidance.has_image_pass else None
+            held = None if inside is None else (inside[few], known[few])
+            own = {name: text[few] for name, text in texts.items()}
+            seed = seed_for(self.task.config.seed, Purpose.PIXELS, begin)
+            rows.append(sample(guidance, own, self._coefficients, condition, self.steps, noise[few], held, seed))
+        latents = torch.cat(rows).float().cpu()
+        mask = (latents[:, 3:] + 1) / 2 if guidance.latents.signed_mask else latents[:, 3:]
+        mask = mask.clamp(0, 1)
+        return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
+
+    def _prompts(self, cameras: CameraBatch) -> list[str]:
+        """The text of each view, as the guidance words it for the first view of a mosaic."""
+        every = self._guidance.view_grid**2
+        azimuths, elevations = (np.repeat(angles, every) for angles in (cameras.azimuth_deg, cameras.elevation_deg))
+        return self._guidance.prompts(GuidanceViews(torch.zeros(len(azimuths), 5, 1, 1), None, azimuths, elevations))

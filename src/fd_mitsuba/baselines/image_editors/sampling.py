@@ -1,0 +1,62 @@
+"""Sampling of latents with a guidance model: DDIM from noise, and the same with a part of the image held."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.denoiser import Denoiser
+
+FIRST, LAST = 0.98, 0.02
+"""Shares of the timesteps between which images are sampled: what the model is asked for when it guides, too."""
+
+
+def timesteps(steps: int, levels: int) -> list[int]:
+    """`steps` falling timesteps of a schedule with `levels` of them, evenly spread from `FIRST` to `LAST`."""
+    high, low = (round(share * (levels - 1)) for share in (FIRST, LAST))
+    return [round(high + (low - high) * index / max(steps - 1, 1)) for index in range(steps)]
+
+
+@torch.no_grad()
+def sample(
+    denoiser: Denoiser,
+    texts: dict[str, Tensor],
+    coefficients: dict[str, float],
+    condition: Tensor | None,
+    steps: int,
+    noise: Tensor,
+    held: tuple[Tensor, Tensor] | None = None,
+    seed: int = 0,
+) -> Tensor:
+    """Clean latents (N, 4, L, L) after `steps` DDIM steps from noise (N, 4, L, L).
+
+    Args:
+        texts: pass -> (N, length, width), those that `coefficients` name; see `sds.cfg_coefficients`.
+        condition: what the network sees beside the latents, for one that does.
+        held: (N, 1, L, L) of zeros and ones and latents (N, 4, L, L). Outside of the ones, each step continues from
+            these latents with noise of its level, and the result has them as they are (RePaint, arXiv 2201.09865,
+            without its repeated steps).
+        seed: of that noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    times = timesteps(steps, len(denoiser.alpha_bars))
+    z, count = noise.to(denoiser.device), len(noise)
+    for index, time in enumerate(times):
+        now = torch.full((count,), time, device=denoiser.device)
+        level = denoiser.alpha_bars[now]
+        seen = denoiser.predict_noise(z.float(), now, texts, condition)
+        noise_hat = sds.combine(seen, coefficients)
+        last = index + 1 == len(times)
+        following = None if last else denoiser.alpha_bars[torch.full_like(now, times[index + 1])]
+        if following is None:
+            z = sds.clean_estimate(z, noise_hat, level)
+        else:
+            z = sds.ddim_step(z, noise_hat, level, following)
+        if held is not None:
+            inside, known = held
+            if following is not None:
+                fresh = torch.randn(known.shape, generator=generator).to(known.device)
+                known = sds.add_noise(known, fresh, following)
+            z = torch.where(inside > 0, z, known)
+    return z

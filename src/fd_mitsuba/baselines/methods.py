@@ -1,0 +1,8 @@
+"""All methods that this package has, registered: import `BASELINES` from here."""
+
+from __future__ import annotations
+
+from fd_mitsuba.baselines import editors_2d, fantasia3d, focaldreamer, voxe
+from fd_mitsuba.baselines.interface import BASELINES
+
+__all__ = ["BASELINES", "editors_2d", "fantasia3d", "focaldreamer", "voxe"]
