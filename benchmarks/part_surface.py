@@ -6,7 +6,8 @@ A row for each part of each run folder; what was the training's own surface is i
     off, off_max        distance of points on the triangles from the function's zero set, in cells of the training
     volume              outside of the base, over that of the training's surface, minus 1; sampled, to about .4 %
     noise               mean angle in degrees between the shading normals and smoothed ones, outside of the base
-    turn_p95            turning angle of the joint within a cell, 95th percentile, degrees
+    turn_p95            turning angle of the joint within a cell, 95th percentile, degrees; a circle of n cells: 360 / n
+    sideways            the same without what the base's own surface turns
     notch               the deepest notch of the joint, in cells; curves counts closed curves
     charts, used        of the atlas: how many, and which share of the square they cover
     seconds             processor time of the final surface
@@ -79,6 +80,7 @@ def measure(folder: Path) -> list[dict[str, Any]]:
             ),
             "curves": joint.curves,
             "turn_p95": percentile(joint.turning_deg),
+            "sideways": percentile(joint.sideways_deg),
             "turn_before": percentile(was.turning_deg),
             "notch": float(joint.notches.max(initial=0)),
             "notch_before": float(was.notches.max(initial=0)),
@@ -136,9 +138,9 @@ def main() -> None:
                 f"least {row['least']:.1f}  off {row['off']:.4f} max {row['off_max']:.3f}  "
                 f"volume {row['volume']:+.2%}  "
                 f"noise {row['noise']:.2f} ({row['noise_before']:.2f})  curves {row['curves']} "
-                f"turn_p95 {row['turn_p95']:.0f} ({row['turn_before']:.0f})  notch {row['notch']:.2f} "
-                f"({row['notch_before']:.2f})  gap {row['gap']:.2f}  charts {row['charts']} used {row['used']:.0%}  "
-                f"{row['seconds']:.1f} s",
+                f"turn_p95 {row['turn_p95']:.0f} ({row['turn_before']:.0f}) sideways {row['sideways']:.0f}  "
+                f"notch {row['notch']:.2f} ({row['notch_before']:.2f})  gap {row['gap']:.2f}  charts {row['charts']} "
+                f"used {row['used']:.0%}  {row['seconds']:.1f} s",
                 flush=True,
             )
 

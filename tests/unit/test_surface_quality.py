@@ -76,6 +76,7 @@ def test_a_round_joint_turns_as_a_circle_does_and_has_no_notch() -> None:
     joint = measure_joint(vertices, faces, base, CELL)
     assert joint.curves == 1 and joint.length == pytest.approx(2 * np.pi * 0.4 / CELL, rel=1e-3)
     assert joint.turning_deg == pytest.approx(np.degrees(CELL / 0.4), rel=0.03)
+    assert joint.sideways_deg == pytest.approx(joint.turning_deg, rel=1e-3)  # the base is flat
     assert joint.notches.max() < 0.01
     curve = joint_curves(vertices, faces, base)[0]
     assert np.hypot(curve[:, 0], curve[:, 2]) == pytest.approx(0.4, abs=1e-4)

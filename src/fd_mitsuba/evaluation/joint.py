@@ -26,12 +26,14 @@ class Joint:
         curves: how many closed curves there are.
         length: of all together, in cells.
         turning_deg: (N,) the angle between directions one cell apart, all along the curves.
+        sideways_deg: (N,) the same without what the base itself turns: the angle in the base's tangent plane.
         notches: (N,) the distance in cells of points all along the curves from the smoothed curves.
     """
 
     curves: int
     length: float
     turning_deg: np.ndarray
+    sideways_deg: np.ndarray
     notches: np.ndarray
 
 
@@ -41,7 +43,7 @@ def measure_joint(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance, c
     Args:
         cell: the training lattice's spacing, in the frame's unit.
     """
-    turning, notches, length = [np.zeros(0)], [np.zeros(0)], 0.0
+    turning, sideways, notches, length = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], 0.0
     curves = joint_curves(vertices, faces, base)
     for curve in curves:
         around = float(np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1).sum()) / cell
@@ -52,12 +54,26 @@ def measure_joint(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance, c
         points = resampled(curve, count)
         ahead = np.roll(points, -_STEPS_A_CELL, axis=0) - points
         behind = points - np.roll(points, _STEPS_A_CELL, axis=0)
-        across = np.linalg.norm(np.cross(ahead, behind), axis=1)
-        turning.append(np.degrees(np.arctan2(across, np.einsum("ij,ij->i", ahead, behind))))
+        turning.append(_angles_deg(ahead, behind))
+        upward = _upward(base, points, cell)
+        flat = [rows - upward * np.einsum("ij,ij->i", rows, upward)[:, None] for rows in (ahead, behind)]
+        sideways.append(_angles_deg(*flat))
         window = int(min(_NOTCH_CELLS, around / 3) * _STEPS_A_CELL) // 2 * 2 + 1
         smooth = savgol_filter(points, window, 2, axis=0, mode="wrap")
         notches.append(np.linalg.norm(points - smooth, axis=1) / cell)
-    return Joint(len(curves), length, np.concatenate(turning), np.concatenate(notches))
+    return Joint(len(curves), length, *(np.concatenate(rows) for rows in (turning, sideways, notches)))
+
+
+def _angles_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    across = np.linalg.norm(np.cross(one, other), axis=1)
+    return np.degrees(np.arctan2(across, np.einsum("ij,ij->i", one, other)))
+
+
+def _upward(base: MeshDistance, points: np.ndarray, cell: float) -> np.ndarray:
+    """Unit normals (N, 3) of the base at points on it, averaged over half a cell."""
+    steps = 0.5 * cell * np.eye(3)
+    slope = np.stack([base.signed(points + step) - base.signed(points - step) for step in steps], axis=1)
+    return -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
 
 
 def joint_curves(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance) -> list[np.ndarray]:

@@ -93,7 +93,7 @@ def export_assets(
     record: dict[str, Any] = {"texture_size": texture_size, "faces": face_budget}
     if scene.surroundings:
         record["surroundings"] = scene.surroundings_ids
-    content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write)
+    content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write, say)
     for exporter in exporters:
         exporter.write(content)
     return {

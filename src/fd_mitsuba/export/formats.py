@@ -46,6 +46,7 @@ class ExportContent:
         corrected: number of a shape -> the mesh that stands in for one that plain Mitsuba would show otherwise.
         write: takes a path below the export folder, such as `stl/part.stl`, and the file's bytes. It is put there
             whole or not at all, and is listed among what was written.
+        say: takes remarks, a line each.
     """
 
     scene: EditScene
@@ -58,6 +59,7 @@ class ExportContent:
     record: dict[str, Any]
     corrected: Mapping[int, bytes]
     write: Callable[[str, bytes], None]
+    say: Callable[[str], None] = lambda line: None
 
     def shape_name(self, shape: str) -> str:
         """What a shape of the base is called in exports."""

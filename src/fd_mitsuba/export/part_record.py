@@ -6,7 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fd_mitsuba.export.solid.contacts import contacts
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.export.solid.walls import measure_walls
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -19,7 +21,9 @@ def part_record(scene: EditScene, solids: dict[str, Solid], opened: Mapping[int,
 
     `canonical_to_user` is the (4, 4) matrix between the frames. For each part: `file`, the PLY in the user's frame;
     `bounds` and `anchor`, both in the user's frame and unit; `volume` in cubic user units; `gap` and `bridged` in the
-    user's unit; `faces`, `manifold`, `islands_removed`. A part without faces is left out.
+    user's unit; `faces`, `manifold`, `islands_removed`. Of parts that are not cut out, `walls` in the user's unit (see
+    `measure_walls`), and `contacts` with the base, among them ends that hang free, with a `gap` (see `contacts`). A
+    part without faces is left out.
 
     Args:
         opened: where parts were cut out: number of a base shape that was cut -> file of what is left of it without the
@@ -44,6 +48,16 @@ def part_record(scene: EditScene, solids: dict[str, Solid], opened: Mapping[int,
             "bridged": solid.bridged * scale,
             "islands_removed": solid.islands_removed,
         }
+        if opened is None:
+            walls = measure_walls(solid, distance)
+            if walls is not None:
+                where = scene.frame.to_user(walls.position).tolist()
+                sizes = {"least": walls.least * scale, "thin": walls.thin * scale}
+                parts[name]["walls"] = sizes | {"position": where}
+            parts[name]["contacts"] = [
+                {"position": scene.frame.to_user(found.position).tolist(), "gap": found.gap * scale}
+                for found in contacts(solid, distance)
+            ]
     to_user = np.linalg.inv(scene.frame.matrix())
     record = {"format": RECORD_FORMAT, "canonical_to_user": to_user.tolist(), "parts": parts}
     if opened is not None:

@@ -13,6 +13,9 @@ import numpy as np
 from fd_mitsuba.config.sections import Section
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.formats import EXPORTERS, METRES, ExportContent, Exporter, Unit
+from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.export.solid.walls import measure_walls
+from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.triangle_mesh import topology
 
 _TYPES = """<?xml version="1.0" encoding="UTF-8"?>
@@ -47,6 +50,19 @@ class Print(Exporter):
         upright = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1) * scale
         content.write("print/asset.stl", stl_bytes(upright, faces))
         content.write(self.leaves, three_mf_bytes(upright, faces))
+        sides = " x ".join(f"{side:.4g}" for side in np.ptp(upright, axis=0))
+        content.say(f"print: {sides} mm{_walls(content, scale)}")
+
+
+def _walls(content: ExportContent, scale: float) -> str:
+    """The thinnest wall of every part, in words; nothing of parts that are cut out."""
+    if content.cut is not None:
+        return ""
+    scene = content.scene
+    base = MeshDistance(scene.frame.to_user(scene.base_canonical.vertices), scene.base_canonical.faces)
+    found = {part.name: measure_walls(Solid(part.mesh.vertices, part.mesh.faces), base) for part in content.parts}
+    words = [f"; walls of {name!r} from {walls.least * scale:.3g} mm on" for name, walls in found.items() if walls]
+    return "".join(words)
 
 
 def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:

@@ -144,7 +144,8 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
     for name, solid in parts.items():
         if len(solid.faces):
             write_mesh(export / part_file(name), solid.vertices, solid.faces, scene)
-    write_json(export / "part.json", part_record(scene, parts, opened))
+    record = part_record(scene, parts, opened)
+    write_json(export / "part.json", record)
     write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
     identical = copy_base(scene, export / "base")
     # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
@@ -167,9 +168,17 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
         "islands_removed": whole.islands_removed,
         "bridged": whole.bridged,
         "gap": whole.gap(base),
+        **_walls_and_ends(record["parts"]),
         "assembled_faces": len(union.faces),
         **figures,
     }
+
+
+def _walls_and_ends(parts: Mapping[str, dict]) -> dict[str, Any]:
+    """Of the parts in `part.json`: the thinnest wall of each, and the ends that hang free; in the scene's unit."""
+    walls = {name: part["walls"]["least"] for name, part in parts.items() if "walls" in part}
+    ends = [{"part": name, **end} for name, part in parts.items() for end in part.get("contacts", []) if end["gap"] > 0]
+    return {"least_wall": walls, "free_ends": ends}
 
 
 def cut_out(scene: EditScene, solids: dict[str, Solid]) -> CutBase:

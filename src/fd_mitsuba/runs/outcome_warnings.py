@@ -34,6 +34,12 @@ def outcome_warnings(metrics: dict[str, Any]) -> list[str]:
             f"a piece of the part is {gap:.3g} away from the base (its longest side is 1.8): move the regions until "
             f"they reach into the base, raise geometry.lambda_tether, or {_OTHER_SEED}"
         )
+    for end in metrics.get("free_ends", []):
+        x, y, z = end["position"]
+        warnings.append(
+            f"an end of part {end['part']!r} hangs free, {end['gap']:.3g} before the base, at ({x:.4g}, {y:.4g}, "
+            f"{z:.4g}) in the scene's units: let the region reach into the base there, or {_OTHER_SEED}"
+        )
     if islands:
         pieces = "a loose piece" if islands == 1 else f"{islands} loose pieces"
         warnings.append(f"{pieces} of the part too small to be meant left out of the export: {_OTHER_SEED}")

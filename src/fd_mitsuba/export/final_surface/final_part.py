@@ -4,7 +4,8 @@ The training marches a grid whose cells are as large as what a picture of 32 pix
 beyond that; what looked torn was the marching. Here the same solid is
 
 1. sampled on a lattice two to four times finer, around its surface only, and marched (`fine_lattice`);
-2. remeshed into triangles of one size, every vertex on the function's zero set (`remesh`, `projection`);
+2. remeshed into triangles of one size, every vertex on the function's zero set, and some of them along the rim of the
+   joint (`meshing`, `remesh`, `projection`, `rim`);
 3. given smooth normals that keep its edges (`shading`).
 
 The offsets of the grid's vertices are left out: they are noise a tenth of a cell high, and make the dents.
@@ -12,19 +13,17 @@ The offsets of the grid's vertices are left out: they are noise a tenth of a cel
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from fd_mitsuba.export.final_surface.contact import contact_of
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
+from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
 from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
-from fd_mitsuba.export.final_surface.projection import project
-from fd_mitsuba.export.final_surface.remesh import remesh
 from fd_mitsuba.export.final_surface.shading import smooth_normals
-from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_pieces import fill_pockets, keep_large
 from fd_mitsuba.export.solid.part_solid import LatticePart, lattice_part, part_solid, part_surface
@@ -35,15 +34,8 @@ from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FINER = (2, 4)
 """How many times finer than the training's the lattice is: as its edges are to be, within these."""
-_SHORTEST_CELLS = 0.2
-"""Shorter edges than this, in cells of the training, show nothing more: the field's own cells are twice a cell."""
-_TRIES = 3
-"""Times that the edge is lengthened if there are still more faces than wanted."""
-_LEAST_ANGLE_DEG = 12.0
-_FILM_CELLS = 0.12
+_FILM_CELLS = 0.06
 """Where the fillet is lower over the base, in cells of the training, the solid dives under the base."""
-_MESHED = 0.9
-"""Share of the budget that is aimed at: how many faces come out is known only afterwards."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +81,7 @@ def final_part(
     """
     coarse = lattice_part(grown, name)
     spacing = coarse.grid.spacing
-    edge = max(_edge_for(_area(*part_surface(coarse)), faces), _SHORTEST_CELLS * spacing)
+    edge = edge_for(*part_surface(coarse), faces, spacing)
     factor = int(np.clip(round(spacing / edge), *_FINER))
     function = part_function(grown, coarse, factor)
     made = refined(coarse.grid, _lattice(coarse, _least(coarse)), function.values, factor)
@@ -100,37 +92,16 @@ def final_part(
     if not len(triangles):
         return _NOTHING
 
-    def onto(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return project(function.with_gradient, points, 0.5 * made.spacing, 1, 1e-3 * spacing)[:2]
-
-    edge = max(_edge_for(_area(vertices, triangles), faces), _SHORTEST_CELLS * spacing)
-    vertices, triangles = remesh(vertices, triangles, edge, onto)
-    for _ in range(_TRIES):
-        if len(triangles) <= faces:
-            break
-        edge *= 1.05 * math.sqrt(len(triangles) / faces)
-        vertices, triangles = remesh(vertices, triangles, edge, onto, 3)
-    near = vertices
-    vertices, _, distance = project(function.with_gradient, near, 0.5 * made.spacing, 12, 1e-4 * spacing)
-    vertices = _without_slivers(near, vertices, triangles)
-    solid = Solid(vertices, triangles, islands, coarse.bridged)
+    try:
+        vertices, triangles, distance = evenly_meshed(function, vertices, triangles, faces, 0.5 * made.spacing)
+        solid = Solid(vertices, triangles, islands, coarse.bridged)
+    except ValueError:
+        solid, distance = _NOTHING.solid, _NOTHING.distance
     if not solid.manifold:
         say(f"part {name or 'part'}: its fine surface is no solid; the training's own is written instead")
         plain = part_solid(grown, name)
         return FinalPart(plain, vertex_normals(plain.vertices, plain.faces), np.zeros(len(plain.vertices)))
     return FinalPart(solid, smooth_normals(vertices, triangles, spacing), distance)
-
-
-def _without_slivers(before: np.ndarray, after: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """`after`, but where triangles have become slivers their corners are as `before`, which is nearly as exact."""
-    moved = after.copy()
-    for _ in range(_TRIES):
-        thin = smallest_angles(moved, triangles) < _LEAST_ANGLE_DEG
-        if not thin.any():
-            break
-        corners = np.unique(triangles[thin])
-        moved[corners] = before[corners]
-    return moved
 
 
 def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFunction:
@@ -154,23 +125,26 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
     )  # fmt: skip
     if base is None:
         return function
-    start, _ = extractor.lattice_values(grown.field)
-    before = _surface_of(coarse, factor, start, lambda points: function.part_values(points, False))
-    if not coarse.bridges:
-        return replace(function, surface=(before, before))
-    function = replace(function, surface=(before, None))
-    after = _surface_of(coarse, factor, coarse.sdf_part, lambda points: function.part_values(points, True))
-    return replace(function, surface=(before, after))
+    if coarse.bridges:
+        start, _ = extractor.lattice_values(grown.field)
+        before = _surface_of(coarse, factor, start, lambda points: function.part_values(points, False))
+        function = replace(function, surface=None if before is None else MeshDistance(*before))
+    own = _surface_of(coarse, factor, coarse.sdf_part, lambda points: function.part_values(points, True))
+    if own is None:
+        return function
+    lattices = _lattice(coarse, coarse.sdf_base), _lattice(coarse, coarse.sdf_part)
+    contact = contact_of(grid, *lattices, base, own, lambda points: function.part_values(points, True) > 0)
+    return replace(function, contact=contact)
 
 
 def _surface_of(
     coarse: LatticePart, factor: int, values: torch.Tensor, function: Callable[[np.ndarray], np.ndarray]
-) -> MeshDistance | None:
+) -> tuple[np.ndarray, np.ndarray] | None:
     made = refined(coarse.grid, _lattice(coarse, values), function, factor)
     if made is None:
         return None
     vertices, faces = made.surface(made.values > 0)
-    return MeshDistance(vertices, faces) if len(faces) else None
+    return (vertices, faces) if len(faces) else None
 
 
 def _meant(coarse: LatticePart, made: FineLattice) -> tuple[np.ndarray, int]:
@@ -190,13 +164,3 @@ def _least(coarse: LatticePart) -> torch.Tensor:
 
 def _lattice(coarse: LatticePart, values: torch.Tensor) -> np.ndarray:
     return values.view((coarse.grid.side,) * 3).numpy()
-
-
-def _area(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-
-
-def _edge_for(area: float, faces: int) -> float:
-    """The edge of equal triangles that cover an area with the share of `faces` that is aimed at."""
-    return math.sqrt(4 * area / (math.sqrt(3) * _MESHED * faces))

@@ -1,12 +1,13 @@
 """A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
 
     part   = min(sdf_part, region + margin, room)      where the part may be at all
-    joined = max(sdf_base - max(away - reach, 0), part) + fillet
+    blend  = part, but -away at the base's surface and inside it, from one to the other within the fillet's width
+    joined = max(sdf_base - 2 max(away - reach, 0), blend) + fillet(sdf_base, blend)
     value  = min(joined, sink - sdf_base, lead)        positive inside the solid
 
-`sdf_base` and the distance to the part's own surface are exact distances to triangles, `sdf_part` is the network. See
-`part_solid` for `joined`, `sink` and `lead`. `away` here is the true distance to the part's surface, or `-part` where
-the field falls faster: the curve along which the solid dives under the base is as smooth as these are.
+`sdf_base` is the exact distance to triangles, `sdf_part` is the network. See `part_solid` for `joined`, `sink` and
+`lead`. `away` is the smoothed distance to where the part is seen to stand on the base (`contact`): the curve along
+which the solid dives under the base, two down for one along, is a level line of it. The edge at `sink` is rounded.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.export.final_surface.contact import Contact
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
 from fd_mitsuba.extraction.active_vertices import DEFAULT_MARGIN
 from fd_mitsuba.extraction.tet_grid import TetGrid
@@ -31,6 +33,10 @@ SdfPart = Callable[[Tensor, Tensor], Tensor]
 _STEP = 1e-3
 """Of the differences that a region's gradient is made of, canonical units."""
 _AT_ONCE = 1 << 16
+_DIVE = 2.0
+"""How steeply the solid dives under the base: a steep rim lies where it lies, whatever the triangles beside it."""
+_ROUND_CELLS = 0.75
+"""Of the solid's lower edge, which nobody sees: triangles across a sharp one would be off its surface."""
 
 
 def fillet_width(union_k: float) -> float:
@@ -63,7 +69,8 @@ class PartFunction:
         sink: see `part_solid`.
         base_lattice: (z, y, x) base sdf at the grid's vertices, to tell where the base is far away.
         bridges: where the part swells to reach the base.
-        surface: the part's own surface before it swells, then after that; None: not known yet.
+        surface: the part's own surface before it swells, for that; None: not known yet.
+        contact: how far a point is from where the part stands on the base; None: nowhere near.
     """
 
     sdf_part: SdfPart
@@ -77,7 +84,8 @@ class PartFunction:
     sink: float
     base_lattice: np.ndarray
     bridges: Sequence[Bridge] = ()
-    surface: tuple[MeshDistance | None, MeshDistance | None] = (None, None)
+    surface: MeshDistance | None = None
+    contact: Contact | None = None
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """The value (N,) float64 at points (N, 3), canonical."""
@@ -100,6 +108,27 @@ class PartFunction:
 
         rows = self._in_pieces(points, both)
         return rows[:, 0], rows[:, 1:]
+
+    def rim(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Two values (N, 2), and gradients (N, 2, 3), that are 0 along the rim where the solid dives under the base.
+
+        The first is how much further than `reach` from the part, the second 0 on the surface as if it did not dive.
+        Infinite, with gradients of 0, where no base is near.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        values, gradients = np.full((len(points), 2), np.inf), np.zeros((len(points), 2, 3))
+        if self.contact is None:
+            return values, gradients
+        x = torch.from_numpy(points.astype(np.float32))
+        near = np.flatnonzero(self._nearest(self.base_lattice, x) > -2 * self.grid.spacing)
+        x = x[torch.from_numpy(near)].requires_grad_()
+        away = _attached(x, *self.contact.at(x.detach().double().numpy()))
+        for number, value in enumerate(
+            [away - self.reach, self._joined(self._base_at(x), self._part(x, True), away, 0)]
+        ):
+            (gradient,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
+            values[near, number], gradients[near, number] = value.detach().numpy(), gradient.numpy()
+        return values, gradients
 
     def base_values(self, points: np.ndarray) -> np.ndarray:
         """`sdf_base` (N,) at points (N, 3); far outside where there is no base."""
@@ -130,10 +159,16 @@ class PartFunction:
         return self._nearest(self.base_lattice, x) > -(max(self.width, swelling) + 2 * self.grid.spacing)
 
     def _beside_base(self, x: Tensor, part: Tensor, base: Tensor) -> Tensor:
-        away = torch.where(part > 0, 0.0, torch.maximum(-part, self._distance_to(self.surface[1], x)))
-        lowered = base - (away - self.reach).clamp(min=0)
-        joined = torch.maximum(lowered, part) + self._fillet(base, part)
-        return torch.minimum(joined, self.sink - base)
+        if self.contact is None:
+            return torch.minimum(part, self.sink - base)
+        away = _attached(x, *self.contact.at(x.detach().double().numpy()))
+        joined = self._joined(base, part, away, _DIVE * (away - self.reach).clamp(min=0))
+        return rounded_minimum(joined, self.sink - base, _ROUND_CELLS * self.grid.spacing)
+
+    def _joined(self, base: Tensor, part: Tensor, away: Tensor, lower: Tensor | float) -> Tensor:
+        if self.width > 0:
+            part = torch.lerp(part, -away, smoothstep(1 + base / self.width))
+        return torch.maximum(base - lower, part) + self._fillet(base, part)
 
     def _fillet(self, base: Tensor, part: Tensor) -> Tensor:
         if self.width == 0:
@@ -151,7 +186,7 @@ class PartFunction:
         if not swollen or not self.bridges or not len(near):
             return part
         chosen, own = x[near], part[near]
-        base, true = self._base_at(chosen), torch.maximum(own, -self._distance_to(self.surface[0], chosen))
+        base, true = self._base_at(chosen), torch.maximum(own, -self._distance_to(self.surface, chosen))
         for bridge in self.bridges:
             weight = bridge_weight(base, bridge) * torch.from_numpy(self._nearest(bridge.own, chosen))
             own = torch.where(weight > 0, torch.maximum(own, true + bridge.swelling * weight), own)
@@ -195,6 +230,18 @@ class PartFunction:
             ahead, behind = union_sdf(list(regions), points + step), union_sdf(list(regions), points - step)
             gradient[:, axis] = (ahead.astype(np.float64) - behind) / (2 * _STEP)
         return _attached(x, value, gradient)
+
+
+def rounded_minimum(one: Tensor, other: Tensor, width: float) -> Tensor:
+    """The lesser (N,) of two values, less what rounds the edge where they differ by less than `width`."""
+    overlap = (width - (one - other).abs()).clamp(min=0)
+    return torch.minimum(one, other) - overlap * overlap / (4 * width)
+
+
+def smoothstep(share: Tensor) -> Tensor:
+    """3 t^2 - 2 t^3 of the share (N,), t between 0 and 1."""
+    share = share.clamp(0, 1)
+    return share * share * (3 - 2 * share)
 
 
 def _attached(x: Tensor, value: np.ndarray, gradient: np.ndarray) -> Tensor:
