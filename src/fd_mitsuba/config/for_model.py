@@ -12,6 +12,8 @@ from fd_mitsuba.config.sections import GuidanceConfig
 from fd_mitsuba.config.toml_reading import apply_override, read_toml
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"
+BUILTIN, BUILTIN_FINE = "builtin", "builtin-fine"
+"""Names of the priors of shapes that are shipped; either goes with the shipped prior of colours."""
 _CONVENTIONS_NAME = "fd_mitsuba.json"
 """A pipeline folder with this file was made by `prior pack`: a small prior, as the built-in one is."""
 
@@ -24,9 +26,14 @@ class ChosenSettings:
     remark: str | None
 
 
+def is_builtin(model: str) -> bool:
+    """Whether `guidance.model` names what is shipped with the package."""
+    return model in (BUILTIN, BUILTIN_FINE)
+
+
 def is_small_prior(model: str) -> bool:
-    """Whether `guidance.model` is the built-in prior or one that was packed like it."""
-    return model == "builtin" or (Path(model).expanduser() / _CONVENTIONS_NAME).is_file()
+    """Whether `guidance.model` is a built-in prior or one that was packed like it."""
+    return is_builtin(model) or (Path(model).expanduser() / _CONVENTIONS_NAME).is_file()
 
 
 def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -> ChosenSettings:
@@ -44,9 +51,9 @@ def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -
         for item in overrides:
             apply_override(wanted, item)
         guidance = wanted.get("guidance")
-        model = str(guidance.get("model", "builtin")) if isinstance(guidance, dict) else "builtin"
+        model = str(guidance.get("model", BUILTIN)) if isinstance(guidance, dict) else BUILTIN
         choice = SMALL_PRESET if is_small_prior(model) else LARGE_PRESET
-        whom = "the built-in prior" if model == "builtin" else model
+        whom = _called(model)
         remark = f"settings: {choice}, which suit {whom}; -c chooses others"
     return ChosenSettings(RunConfig.load(choice, overrides), remark)
 
@@ -67,7 +74,7 @@ def misfits(config: RunConfig) -> list[str]:
     preset = SMALL_PRESET if small else LARGE_PRESET
     usual = RunConfig.load(read_toml(preset))
     named = ", ".join(f"{key} = {_text(value)} ({preset}: {_text(_value(usual, key))})" for key, value in wrong)
-    whom = "the built-in prior" if config.guidance.model == "builtin" else config.guidance.model
+    whom = _called(config.guidance.model)
     other = "name a Stable Diffusion model in guidance.model" if small else "set guidance.model=builtin"
     return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}"]
 
@@ -85,6 +92,10 @@ _LARGE: dict[str, Callable[[Any], bool]] = {
     "appearance.guidance_scale": lambda scale: scale >= 7,
 }
 """With the small scales of the built-in prior, score distillation of Stable Diffusion stays a blur (DreamFusion)."""
+
+
+def _called(model: str) -> str:
+    return {BUILTIN: "the built-in prior", BUILTIN_FINE: "the fine built-in prior"}.get(model, model)
 
 
 def _value(config: RunConfig, key: str) -> Any:

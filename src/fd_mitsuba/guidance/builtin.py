@@ -5,18 +5,31 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
 from fd_mitsuba.errors import UserError
 
 BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "shapes"
+FINE_FOLDER = BUILTIN_FOLDER.with_name("shapes_fine")
 APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours")
 SUMS_NAME = "SHA256SUMS"
+
+
+def shipped_folder(model: str, appearance: bool = False) -> Path | None:
+    """Where the prior lies that a value of `guidance.model` names; None: it names none that is shipped.
+
+    Args:
+        appearance: the prior of colours, which goes with either of the others.
+    """
+    if not is_builtin(model):
+        return None
+    return APPEARANCE_FOLDER if appearance else FINE_FOLDER if model == BUILTIN_FINE else BUILTIN_FOLDER
 
 
 def builtin_folder(folder: Path = BUILTIN_FOLDER) -> Path:
     """The pipeline folder of a built-in prior, after its files were checked against `SHA256SUMS` if that is there.
 
     Args:
-        folder: `BUILTIN_FOLDER` for the geometry stage, `APPEARANCE_FOLDER` for the appearance stage.
+        folder: see `shipped_folder`.
 
     Raises:
         UserError: no prior in this installation, a file missing or changed, an unreadable list of hashes.

@@ -18,6 +18,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
@@ -85,7 +86,7 @@ class DiffusionGuidance(Denoiser):
 
     def for_appearance(self, appearance: AppearanceConfig) -> DiffusionGuidance:
         """The guidance of the appearance stage; with the same networks in memory, unless the model is `builtin`."""
-        if self.config.model == "builtin":
+        if is_builtin(self.config.model):
             return self.load(self.config, str(self.device), appearance)
         return type(self)(self.components, self.config, str(self.device), appearance)
 

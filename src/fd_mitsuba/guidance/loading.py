@@ -12,8 +12,9 @@ import torch
 
 from fd_mitsuba.backend.collector import uncollected
 from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.errors import UserError, first_line, out_of_memory
-from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
+from fd_mitsuba.guidance.builtin import builtin_folder, shipped_folder
 from fd_mitsuba.guidance.control import check_controlnet, locate_controlnet
 from fd_mitsuba.guidance.image_prompt import add_image_prompt, asks_for_image_prompt
 from fd_mitsuba.guidance.layout import (
@@ -78,7 +79,7 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
     with_picture = asks_for_image_prompt(config)
-    if (config.lora or config.words or config.controlnet or with_picture) and config.model == "builtin":
+    if (config.lora or config.words or config.controlnet or with_picture) and is_builtin(config.model):
         raise UserError(
             "guidance.lora, words, image_prompt and controlnet are made for Stable Diffusion; set guidance.model to "
             "such a model"
@@ -121,8 +122,8 @@ def locate(model: str, appearance: bool = False) -> Path:
 
     `HF_HUB_OFFLINE=1` keeps to what is in the hub's cache.
     """
-    if model == "builtin":
-        return builtin_folder(APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER)
+    if (shipped := shipped_folder(model, appearance)) is not None:
+        return builtin_folder(shipped)
     folder = local_folder(model, "guidance.model", "Stable-Diffusion layout")
     return _snapshot(model) if folder is None else folder
 

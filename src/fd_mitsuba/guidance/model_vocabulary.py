@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER
+from fd_mitsuba.guidance.builtin import shipped_folder
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 
@@ -13,8 +13,8 @@ def vocabulary_of(model: str, appearance: bool = False) -> Vocabulary | None:
     """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion.
 
     Args:
-        model: `builtin`, a folder, or a hub id, of which nothing is known.
-        appearance: of `builtin`, the prior of the appearance stage.
+        model: `builtin`, `builtin-fine`, a folder, or a hub id, of which nothing is known.
+        appearance: of a built-in one, the prior of the appearance stage.
     """
-    folder = (APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER) if model == "builtin" else Path(model)
+    folder = shipped_folder(model, appearance) or Path(model)
     return read_model_conventions(folder).vocabulary if folder.is_dir() else None

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fd_mitsuba.config.for_model import BUILTIN_FINE
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading, read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 
@@ -25,6 +27,12 @@ def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = ""
             'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
             "geometry.lambda_sds=0"
         )
+    if (fine := vocabulary_of(BUILTIN_FINE)) is not None and vocabulary != fine:
+        if known := read_prompt(prompt, fine, base_prompt).parts:
+            raise UserError(
+                f"prompt {prompt!r}: the built-in prior knows no such part, but the fine one knows {', '.join(known)}; "
+                f"set guidance.model={BUILTIN_FINE}"
+            )
     hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
     which = f"knows no part {', '.join(map(repr, reading.unknown_parts))}" if reading.unknown_parts else ""
     raise UserError(

@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.part_record import part_file
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
@@ -145,7 +146,7 @@ def cuts_stay_plain(scene: EditScene, config: RunConfig, given: object = None) -
         given: a caller's own guidance.
     """
     diffusion = config.guidance.kind.kind == "diffusion"
-    by_builtin = config.guidance.model == "builtin" and diffusion and not hasattr(given, "guide_appearance")
+    by_builtin = is_builtin(config.guidance.model) and diffusion and not hasattr(given, "guide_appearance")
     return scene.subtracts and config.appearance.lambda_sds > 0 and by_builtin
 
 

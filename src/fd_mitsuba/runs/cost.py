@@ -9,6 +9,7 @@ import numpy as np
 
 from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import GuidanceConfig, RunConfig
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
@@ -75,7 +76,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     queries = active + geometry.focal_samples
     field = 3.5e-8 * config.field.levels * queries
     surface = 8e-7 * 8.6 * vertices ** (2 / 3)
-    builtin = guidance.model == "builtin"
+    builtin = is_builtin(guidance.model)
     cores = min(cores_in_use(), _MOST_CORES_OF_USE)
     side = 32 if builtin else 64
     refined = 1 - geometry.coarse_fraction
@@ -168,7 +169,7 @@ def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encode
         forward, encoder: seconds for a view through the UNet, and through the VAE's encoder and back.
     """
     settings = config.appearance
-    builtin = config.guidance.model == "builtin"
+    builtin = is_builtin(config.guidance.model)
     guided = settings.lambda_sds > 0
     side = settings.picture_size or ((32 if builtin else 512) if guided else 128)
     samples = settings.views * side**2 * settings.spp
@@ -189,6 +190,6 @@ def unet_weights(model: str) -> tuple[float, str]:
     if files:
         size = max(file.stat().st_size for file in files)
         return size / (2 if ".fp16." in files[0].name else 4), f"from {folder}"
-    if model == "builtin":
+    if is_builtin(model):
         return 7.0e6, "the built-in prior"
     return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"

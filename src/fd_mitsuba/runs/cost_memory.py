@@ -14,6 +14,7 @@ from PIL import Image
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.bounds import MOST_SAMPLES
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.config.sections import FieldConfig, OutputConfig, TextureConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
@@ -101,7 +102,7 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet
     terms["output.turntable_size"] = _ring(config.output)
     if lit:
         settings, output = config.appearance, config.output
-        side = settings.picture_size or (32 if config.guidance.model == "builtin" else 512)
+        side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 512)
         step = settings.views * side**2 * settings.spp
         photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
         name = "output.picture_size" if photograph >= step else "appearance.spp"
@@ -178,7 +179,7 @@ def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float) -> flo
     wanted += [config.appearance.lambda_sds > 0] * ("appearance" in stages)
     if not any(wanted):
         return 0.0
-    if guidance.model == "builtin":
+    if is_builtin(guidance.model):
         return _BUILTIN
     size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
     if guidance.controlnet:

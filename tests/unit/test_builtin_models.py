@@ -1,0 +1,62 @@
+"""The names of the shipped priors: what they stand for, and how their words differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import INTEGRATOR
+
+from fd_mitsuba.config import settings_for_run
+from fd_mitsuba.config.for_model import is_builtin, is_small_prior
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, FINE_FOLDER, shipped_folder
+from fd_mitsuba.guidance.known_colours import material_left_out
+from fd_mitsuba.guidance.loading import locate
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
+from fd_mitsuba.guidance.understood_prompt import understood_prompt
+from fd_mitsuba.runs.check import check_scene
+from fd_mitsuba.runs.cost import unet_weights
+from fd_mitsuba.scene.edit_scene import load_edit_scene
+
+FINE = "guidance.model=builtin-fine"
+
+
+def test_names_stand_for_folders() -> None:
+    assert [locate(name) for name in ("builtin", "builtin-fine")] == [BUILTIN_FOLDER, FINE_FOLDER]
+    assert [locate(name, appearance=True) for name in ("builtin", "builtin-fine")] == [APPEARANCE_FOLDER] * 2
+    assert shipped_folder("a/folder") is None and not is_builtin("a/folder") and is_small_prior("builtin-fine")
+
+
+def test_the_fine_one_gets_the_quick_settings() -> None:
+    chosen = settings_for_run(None, [FINE])
+    assert chosen.config.geometry.steps == settings_for_run("quick").config.geometry.steps
+    assert chosen.remark == "settings: quick, which suit the fine built-in prior; -c chooses others"
+
+
+def test_its_weights_are_counted_right() -> None:
+    size = (FINE_FOLDER / "unet" / "diffusion_pytorch_model.safetensors").stat().st_size
+    assert unet_weights("builtin-fine")[0] == pytest.approx(size / 2, rel=0.02)
+
+
+def test_a_part_that_only_the_fine_one_knows() -> None:
+    coarse, fine = vocabulary_of("builtin"), vocabulary_of("builtin-fine")
+    assert coarse is not None and fine is not None
+    with pytest.raises(UserError, match="the fine one knows mushroom cap; set guidance.model=builtin-fine"):
+        understood_prompt("a pig with a mushroom cap", coarse)
+    assert understood_prompt("a pig with a mushroom cap", fine).parts == ("mushroom cap",)
+    with pytest.raises(UserError, match="knows no such part; nearest: wings"):
+        understood_prompt("a pig with a laptop", coarse)
+
+
+def test_what_the_prior_of_colours_does_not_know_keeps_its_material(make_scene: Callable[..., Path]) -> None:
+    scene = load_edit_scene(make_scene(integrator=INTEGRATOR.replace("two wings", "a mushroom cap")))
+    config = settings_for_run(None, [FINE]).config
+    line = material_left_out(scene, config)
+    assert line is not None and "does not know mushroom cap: only the geometry stage runs" in line
+    report = check_scene(scene, config)
+    assert report.refusal is None and line in report.warnings
+    winged = load_edit_scene(make_scene())
+    assert material_left_out(winged, config) is None
+    assert material_left_out(scene, settings_for_run(None, [FINE, "appearance.lambda_sds=0"]).config) is None
