@@ -14,6 +14,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from PIL import Image
 
+from fd_mitsuba.backend.collector import long_lived
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.evaluation.report.curves import stage_curves
 from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
@@ -144,7 +145,8 @@ def report_or_say(folder: Path, say: Callable[[str], None]) -> None:
     if not (folder / "run.json").is_file():
         return
     try:
-        write_report(folder)
+        with long_lived():  # reading a film back ends with a search for garbage, and there are several
+            write_report(folder)
     except Exception as error:
         say(" ".join(f"{folder}: no report ({type(error).__name__}: {error}); the run itself is complete".split()))
 
