@@ -7,20 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
+from fd_mitsuba.backend.speed import processor_speed
 from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import GuidanceConfig, RunConfig
-from fd_mitsuba.config.for_model import is_builtin
+from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
 
-START_AND_EXPORT_SECONDS = 15.0
-"""What every run takes besides its steps: imports, kernels, meshes, turntable."""
+START_AND_EXPORT_SECONDS = 20.0
+"""What every run takes besides its steps: imports, meshes, turntable, report. A first run compiles as long again."""
 
-LIT_PICTURES_SECONDS = 45.0
-"""What the appearance stage takes besides its steps: kernels, lit turntable, baked textures."""
+LIT_PICTURES_SECONDS = 12.0
+"""What the appearance stage takes besides its steps and photographs: lit turntable, baked textures."""
+
+PHOTOGRAPHS_SECONDS = 11.0
+"""Of `output.picture_size` = 768; half of it is for what has a size of its own."""
+
+_GFLOPS = 104.0
+"""Of one core of the machine that all these seconds are of; see `processor_speed`."""
 
 _OPERATIONS_ELSEWHERE = {"float32": 3e13, "bfloat16": 6e13, "float16": 6e13}
 """Floating-point operations a second of a graphics card that is not here: they differ by a factor of ten and more."""
@@ -31,6 +38,9 @@ _CONTROLNET = 0.42
 _SECONDS_PER_MILLION_FACES = 20.0
 """In each stage: search trees, signs of the grid, meshes to write."""
 _SECONDS_PER_MILLION_LIGHT_PIXELS = 0.5
+
+_FINER = 2.2
+"""How many times as long the fine prior takes for a view."""
 
 _REACH = 0.15
 """How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
@@ -62,9 +72,10 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
         step = fixed + field (active vertices) + surface (faces) + rays + guidance (passes of the networks)
 
     averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
-    them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores, no GPU:
-    0.28 s a step of `configs/quick.toml`, 0.42 s on the grid of 128 cells a side, 0.7 s in the refined phase;
-    importing, compiling and exporting took 15 s.
+    them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores of
+    104 GFLOP/s, no GPU: 0.125 s a step of `configs/quick.toml`, 0.178 s on the grid of 128 cells a side, 0.297 s in the
+    refined phase, 0.201 s with `builtin-fine`; all else of a geometry run took 18 s. All of them are scaled by how fast
+    this machine's core is at this moment.
     """
     geometry, guidance = config.geometry, config.guidance
     axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)
@@ -75,28 +86,32 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
 
     queries = active + geometry.focal_samples
     field = 3.5e-8 * config.field.levels * queries
-    surface = 8e-7 * 8.6 * vertices ** (2 / 3)
+    surface = 4e-7 * 8.6 * vertices ** (2 / 3)
     builtin = is_builtin(guidance.model)
     cores = min(cores_in_use(), _MOST_CORES_OF_USE)
     side = 32 if builtin else 64
     refined = 1 - geometry.coarse_fraction
-    coarse_rays = 6e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
-    refined_rays = 6e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
+    coarse_rays = 3e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
+    refined_rays = 3e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
     weights, source = unet_weights(guidance.model)
+    slower = _GFLOPS * 1e9 / processor_speed()
     guided = geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
     speed = None if builtin or not guided else _speed(guidance)
     passes = geometry.views * _passes(scene, guidance, guidance.guidance_scale)
     if speed is None:
-        forward = encoder = 0.1 / 4 * 2 / cores  # four views are one picture to it; measured with two cores
+        encoder = 0.0082 * slower * (0.75 + 0.5 / cores)  # four views are one picture to it; measured with two cores
+        forward = encoder * (_FINER if guidance.model == BUILTIN_FINE else 1.0)
     else:
         # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
         forward, encoder = 800.0 * weights / speed.unet, 2.2e12 / speed.vae
-    image = passes * forward + (1 - refined) * coarse_rays + refined * (refined_rays + geometry.views * encoder)
-    step = 0.03 + field + surface + (image if geometry.lambda_sds > 0 else 0.0)
+    rays = slower * ((1 - refined) * coarse_rays + refined * refined_rays)
+    image = passes * forward + rays + refined * geometry.views * encoder
+    step = slower * (0.03 + field + surface) + (image if geometry.lambda_sds > 0 else 0.0)
     size = SceneSize.of(scene)
     more_faces, more_light = size.faces / 1e6, size.light_pixels / 1e6
     assumptions = (
-        f"{cores} cores, otherwise idle, and views at the size of the latent",
+        f"{cores} cores of {processor_speed() / 1e9:.3g} GFLOP/s, otherwise idle, views at the size of the latent",
+        "that Mitsuba's kernels are in its cache: a first run compiles them, some 20 s more",
         *([] if speed is None else [speed.text]),
         f"a base of {size.faces} faces, light of {more_light:.3g} million pixels",
         f"a UNet of {weights / 1e6:.3g} million weights ({source})",
@@ -111,15 +126,22 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
         warning = memory_warning(scene, terms) or ""
     except UserError as error:
         warning = str(error)
-    total = step * geometry.steps + START_AND_EXPORT_SECONDS + _SECONDS_PER_MILLION_FACES * more_faces
-    lit = _appearance_step(scene, config, forward, encoder)
-    lit_total = lit * config.appearance.steps + LIT_PICTURES_SECONDS
-    lit_total += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
+    once = START_AND_EXPORT_SECONDS + _SECONDS_PER_MILLION_FACES * more_faces
+    total = step * geometry.steps + slower * once
+    # The prior of colours is as coarse as ever.
+    lit = _appearance_step(scene, config, encoder if builtin else forward, encoder, slower)
+    once = LIT_PICTURES_SECONDS + _photographs(config.output.picture_size)
+    once += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
+    lit_total = lit * config.appearance.steps + slower * once
     if left_out:
         lit = lit_total = 0.0
     return CostEstimate(
         active, share, step, total, shape_memory, lit, lit_total, sum(terms.values()), warning, assumptions
     )
+
+
+def _photographs(size: int) -> float:
+    return PHOTOGRAPHS_SECONDS * (0.5 + 0.5 * (size / 768) ** 2) if size else 0.0
 
 
 @dataclass(frozen=True)
@@ -159,14 +181,15 @@ def _passes(scene: EditScene, guidance: GuidanceConfig, scale: float) -> int:
     return passes
 
 
-def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encoder: float) -> float:
+def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encoder: float, slower: float) -> float:
     """Seconds of a step of the appearance stage: fixed + light samples + passes of the networks.
 
-    Fitted to `benchmarks/appearance_step.py` (0.5 s for 4 views of 128 x 128 pixels and 16 samples) and to runs of
-    `configs/quick.toml`. Each bounce beyond the first costs about half of that light.
+    Fitted to `benchmarks/appearance_step.py` (0.19 s for 4 views of 128 x 128 pixels and 16 samples) and to runs of
+    `configs/quick.toml` (0.095 s). Each bounce beyond the first costs about half of that light.
 
     Args:
         forward, encoder: seconds for a view through the UNet, and through the VAE's encoder and back.
+        slower: seconds of this machine over those of the one that the constants are of.
     """
     settings = config.appearance
     builtin = is_builtin(config.guidance.model)
@@ -174,13 +197,13 @@ def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encode
     side = settings.picture_size or ((32 if builtin else 512) if guided else 128)
     samples = settings.views * side**2 * settings.spp
     depth = settings.max_depth if settings.max_depth > 0 else 8
-    light = 3.4e-7 * samples * (1 + 0.5 * (depth - 2))
+    light = slower * 1.3e-7 * samples * (1 + 0.5 * (depth - 2))
     passes = settings.views * _passes(scene, config.guidance, settings.guidance_scale)
     if config.guidance.controlnet:
         passes *= 1 + _CONTROLNET
     # A prior in pixels needs no encoder; it is shown the part in clay as well.
     image = passes * forward + (0.3 * light if builtin else settings.views * encoder)
-    return 0.15 + light + (0.03 if settings.style else 0.0) + (image if guided else 0.0)
+    return slower * (0.05 + (0.03 if settings.style else 0.0)) + light + (image if guided else 0.0)
 
 
 def unet_weights(model: str) -> tuple[float, str]:

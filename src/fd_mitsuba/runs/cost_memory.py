@@ -26,16 +26,17 @@ from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
 
 _MIB = 2.0**20
 _IMPORTS, _BUILTIN = 390.0, 200.0
-_SHAPE, _MATERIAL = 210.0, 490.0
+_SHAPE, _MATERIAL = 390.0, 370.0
 """What the geometry stage with its exports, and then the appearance stage with its own, add in any case."""
 _PER_FACE = {"check": 830.0, "run": 990.0}
 _PER_LIGHT_PIXEL = {"check": 70.0, "run": 112.0}
 _PER_HELD_LIGHT_PIXEL = 41.0
 _PER_TEXTURE_VALUE = {"check": 3.0, "run": 29.0}
-_PER_GRID_VERTEX = 140.0
+_PER_GRID_VERTEX = 165.0
 _PER_TEXEL = 178.0
 _PER_TABLE_BYTE = 10.0
 """A field's parameters, their gradients and moments, and the copies of a checkpoint."""
+_PER_PHOTOGRAPHED_PIXEL = 250.0
 _PER_SAMPLE, _PER_RAY, _PER_FRAME_PIXEL = 59.0, 85.0, 30.0
 _USUAL_FRAME_PIXELS = 48 * 256**2
 _USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, SAMPLES_AT_ONCE, 1024**2
@@ -107,6 +108,7 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet
         photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
         name = "output.picture_size" if photograph >= step else "appearance.spp"
         terms[name] = _PER_SAMPLE * (max(photograph, step) - _USUAL_SAMPLES) / _MIB
+        terms["photographs"] = _PER_PHOTOGRAPHED_PIXEL * output.picture_size**2 / _MIB
         terms["output.texture_size"] = _PER_TEXEL * (output.texture_size**2 - _USUAL_TEXELS) / _MIB
         terms["texture.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.texture) / _MIB
     return terms
