@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fd_mitsuba.config.guidance_section import GuidanceConfig
 from fd_mitsuba.config.run_config import RunConfig
-from fd_mitsuba.config.sections import GuidanceConfig
 from fd_mitsuba.config.toml_reading import apply_override, read_toml
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"

@@ -30,7 +30,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import ValidationError
 
 from fd_mitsuba.config.choice import Choice
-from fd_mitsuba.config.sections import Section
+from fd_mitsuba.config.section import Section
 from fd_mitsuba.config.toml_reading import first_problem
 from fd_mitsuba.errors import UserError
 

@@ -11,15 +11,15 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
+from fd_mitsuba.config.guidance_section import GuidanceConfig
 from fd_mitsuba.config.identity import MAY_CHANGE, identity_settings
+from fd_mitsuba.config.section import Section
 from fd_mitsuba.config.sections import (
     AppearanceConfig,
     CamerasConfig,
     FieldConfig,
     GeometryConfig,
-    GuidanceConfig,
     OutputConfig,
-    Section,
     TextureConfig,
 )
 from fd_mitsuba.config.toml_reading import apply_override, first_problem, guilty_override, read_toml, shortened

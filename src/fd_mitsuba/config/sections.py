@@ -1,11 +1,13 @@
-"""The sections of a run's settings: one frozen, strict model each. `config` puts them together and reads them."""
+"""The sections of a run's settings: one frozen, strict model each. `config` puts them together and reads them.
+
+That of the guidance has a file of its own, `guidance_section.py`.
+"""
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from fd_mitsuba.config.bounds import (
     MOST_SAMPLES,
@@ -16,7 +18,6 @@ from fd_mitsuba.config.bounds import (
     GuidanceScale,
     Length,
     Levels,
-    ModelName,
     Neurons,
     Points,
     Range,
@@ -27,26 +28,10 @@ from fd_mitsuba.config.bounds import (
     Weight,
     Width,
 )
-from fd_mitsuba.config.choice import Choice, Weighted
+from fd_mitsuba.config.choice import Weighted
 from fd_mitsuba.config.identity import MAY_CHANGE
-from fd_mitsuba.conventions import NormalAugmentation, NormalSpace, TextureChannel, Weighting
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _large_counts_meet_their_bound(cls, data: Any) -> Any:
-        """Pydantic takes 1e300 for no whole number at all, and would not say which are possible."""
-        if not isinstance(data, dict):
-            return data
-        counts = {name for name, field in cls.model_fields.items() if field.annotation is int}
-        return {name: _whole(value) if name in counts else value for name, value in data.items()}
-
-
-def _whole(value: Any) -> Any:
-    return int(value) if isinstance(value, float) and math.isfinite(value) and value.is_integer() else value
+from fd_mitsuba.config.section import Section
+from fd_mitsuba.conventions import NormalSpace, TextureChannel, Weighting
 
 
 class FieldConfig(Section):
@@ -250,76 +235,6 @@ class AppearanceConfig(Section):
                 f"at most {MOST_SAMPLES} are possible"
             )
         return self
-
-
-class GuidanceConfig(Section):
-    """The model that guides both stages, and how its gradient is made."""
-
-    kind: Choice = Choice(kind="diffusion")
-    """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
-    model: ModelName = "builtin"
-    """`builtin`, `builtin-fine`, a folder in Stable-Diffusion layout, or a hub id."""
-    lora: tuple[ModelName, ...] = ()
-    """LoRA files (.safetensors), or folders with one each, added to the model's weights."""
-    lora_scale: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)] = 1.0
-    """How much of each is added."""
-    words: tuple[ModelName, ...] = ()
-    """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
-    image_prompt: ModelName = ""
-    """A picture that the material is to resemble, beside the prompt; appearance stage, through an IP-Adapter."""
-    ip_adapter: ModelName = ""
-    """The IP-Adapter's .safetensors file, or a folder with one; a plain one for the model."""
-    ip_adapter_encoder: ModelName = ""
-    """The folder of the image encoder that the IP-Adapter was made with."""
-    image_prompt_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
-    """How much the picture counts."""
-    controlnet: ModelName = ""
-    """A ControlNet's folder or hub id, which is shown the surface in the appearance stage; none by default."""
-    controlnet_scale: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
-    """How much the ControlNet steers."""
-    controlnet_sees: Literal["depth", "normal"] = "depth"
-    """What of the surface it is shown; what it was trained with."""
-    variant: Choice = Choice(kind="sds")
-    """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
-    guidance_scale: GuidanceScale = 100.0
-    """Written as diffusers does: uncond + w (text - uncond)."""
-    image_guidance_scale: GuidanceScale = 1.0
-    """Weight of the base's image, for models with 8 input channels."""
-    perp_neg: Weight = 0.0
-    """Perp-Neg: weight of what the negative prompt asks for beside the prompt; 0: it stands for the empty text."""
-    mask_margin: Annotated[int, Field(ge=0, le=64)] = 2
-    """Inpainting models (9 input channels) repaint the focal regions and so many latent cells around them."""
-    weighting: Weighting = "sds"
-    """Weight of a timestep; `guidance.sds` has the formulas."""
-    timestep_range_coarse: Range = (0.02, 0.35)
-    """Noise levels that are drawn in the coarse phase, as shares of all timesteps."""
-    timestep_range_refined: Range = (0.02, 0.35)
-    """The same in the refined phase."""
-    timestep_annealing: Literal["none", "linear", "sqrt"] = "none"
-    """`none` draws t; the others go through the range from its upper to its lower end, once a phase."""
-    mask_channel: Literal["auto", "unit", "signed"] = "auto"
-    """The coarse phase's mask: `unit` 0 to 1, as in the paper; `signed` -1 to 1; `auto`: `signed` for packed priors."""
-    normal_augmentation: NormalAugmentation = "none"
-    """Random turns of the coarse phase's normals, a view each: the paper names an augmentation and not which."""
-    refined_background: Literal["black", "grey", "white"] = "black"
-    """Behind the normals of the refined phase, as colours."""
-    reduction: Literal["mean", "sum"] = "mean"
-    """Of the gradients of a step's pictures."""
-    normalise_gradient: bool = False
-    """Bring the guidance's gradient to a fixed size, so that the other weights are relative to it."""
-    views_per_call: Annotated[Views, MAY_CHANGE] = 4
-    """Pictures sent through the UNet at once; fewer need less memory."""
-    dtype: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Precision of the UNet; the VAE stays in float32."""
-    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d{1,3})?)$"), MAY_CHANGE] = "cpu"
-    """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
-    view_prompts: bool = True
-    """Add words for the view's direction to the prompt."""
-
-    @property
-    def source(self) -> str:
-        """What guides, for messages and records: the model, or the name of another module's guidance."""
-        return self.model if self.kind.kind == "diffusion" else self.kind.kind
 
 
 class CamerasConfig(Section):

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from fd_mitsuba.config.registry import Registry
-from fd_mitsuba.config.sections import Section
+from fd_mitsuba.config.section import Section
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.export.bake.tangents import vertex_tangents
 from fd_mitsuba.export.base_shapes import BaseShape

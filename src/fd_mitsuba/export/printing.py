@@ -10,7 +10,7 @@ from functools import reduce
 import manifold3d
 import numpy as np
 
-from fd_mitsuba.config.sections import Section
+from fd_mitsuba.config.section import Section
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.formats import EXPORTERS, METRES, ExportContent, Exporter, Unit
 from fd_mitsuba.export.solid.solid import Solid

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import NoSettings, Registry
-from fd_mitsuba.config.sections import Section
+from fd_mitsuba.config.section import Section
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.tessellate import Arrays, unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology

@@ -17,7 +17,8 @@ from PIL import Image
 from fd_mitsuba.backend.collector import long_lived
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.evaluation.report.curves import stage_curves
-from fd_mitsuba.evaluation.report.metric_table import duration, figure_tables
+from fd_mitsuba.evaluation.report.metric_table import figure_tables
+from fd_mitsuba.evaluation.report.run_numbers import Titled, chips, tiles, timings, verdict
 from fd_mitsuba.evaluation.report.run_record import RunRecord, changed_settings, read_run
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.glb import glb_content
@@ -68,14 +69,6 @@ class TriedSeed(NamedTuple):
     link: str
 
 
-class Titled(NamedTuple):
-    """A picture's data URI, or a figure's text, and what it is."""
-
-    title: str
-    uri: str = ""
-    text: str = ""
-
-
 def write_report(folder: Path) -> Path:
     """Write the report of a run, finished or not, from what lies in its folder; returns its path.
 
@@ -101,12 +94,12 @@ def _page(run: RunRecord) -> str:
         run=run,
         css=(PAGE / "page.css").read_text(encoding="utf-8"),
         js=(PAGE / "viewer.js").read_text(encoding="utf-8"),
-        chips=_chips(run),
+        chips=chips(run),
         pairs=_pairs(folder),
         part=None if part is None else strip(part, common_crop(part)),
         part_files=", ".join(f"export/{path.name}" for path in sorted((folder / "export").glob("part_*.ply"))),
-        tiles=_tiles(run),
-        verdict=_verdict(run),
+        tiles=tiles(run),
+        verdict=verdict(run),
         tries=_tries(folder),
         closeup=_picture(folder / "images" / "closeup.png", _CLOSE_SIZE),
         channels=_picture(folder / "images" / "channels.png", 1536),
@@ -119,7 +112,7 @@ def _page(run: RunRecord) -> str:
         charts={stage: stage_curves(rows) for stage, rows in run.rows.items()},
         evaluation=figure_tables(run.evaluation, "evaluation"),
         metrics=figure_tables(run.metrics, "geometry"),
-        timings=figure_tables(_timings(run), "timings"),
+        timings=figure_tables(timings(run), "timings"),
         settings=figure_tables(run.settings, "run", settings=True),
         changed=changed_settings(run.settings),
         origin=figure_tables({"scene": run.identity, "environment": run.environment}, "run"),
@@ -228,49 +221,6 @@ def _glb(folder: Path) -> tuple[str | None, str]:
     return base64.b64encode(data).decode(), ""
 
 
-def _chips(run: RunRecord) -> list[str]:
-    guidance = run.settings.get("guidance")
-    model = guidance.get("model") if isinstance(guidance, dict) else None
-    return [
-        *([f"seed {run.settings['seed']}"] if "seed" in run.settings else []),
-        *([f"guidance: {model}"] if model else []),
-        *(f"{name} {rows[-1].get('step')} steps" for name, rows in run.rows.items() if rows),
-    ]
-
-
-def _tiles(run: RunRecord) -> list[Titled]:
-    metrics, tiles = run.metrics, []
-
-    def tile(name: str, title: str, form: Callable[[float], str]) -> None:
-        value = metrics.get(name)
-        value = metrics.get("appearance", {}).get(name) if value is None else value
-        if isinstance(value, int | float):
-            tiles.append(Titled(title, text=form(value)))
-
-    tile("inside_fraction", "of the part inside its region", "{:.1%}".format)
-    tile("overlap_fraction", "of the part inside the base", "{:.1%}".format)
-    tile("base_identical", "base unchanged, byte for byte", lambda value: "yes" if value else "no")
-    tile("base_psnr_db", "base outside the part, PSNR", lambda value: "exact" if value >= 199 else f"{value:.0f} dB")
-    faces = metrics.get("part_faces", {})
-    if faces and all(isinstance(count, int) for count in faces.values()):
-        tiles.append(Titled("faces of the part", text=f"{sum(faces.values()):,}"))
-    clip = run.evaluation.get("clip")
-    if isinstance(clip, dict):
-        for name, title in (("sim", "CLIP similarity"), ("dir_dot", "CLIP direction")):
-            if isinstance(clip.get(name), float):
-                tiles.append(Titled(f"{title}, judge {clip.get('judge', 'unknown')}", text=f"{clip[name]:.3f}"))
-    spent = sum(run.seconds().values())
-    if spent:
-        tiles.append(Titled("in the steps of all stages", text=duration(spent)))
-    return tiles
-
-
-def _verdict(run: RunRecord) -> dict | None:
-    """What the evaluator says of the part, where it was asked."""
-    verdict = run.metrics.get("verdict")
-    return verdict if isinstance(verdict, dict) and isinstance(verdict.get("line"), str) else None
-
-
 def _tries(folder: Path) -> list[TriedSeed]:
     """The seeds of `run --tries`."""
     record = read_json_object(folder / TRIES_RECORD) or {}
@@ -291,16 +241,6 @@ def _tries(folder: Path) -> list[TriedSeed]:
                 link,
             )
         )
-    return found
-
-
-def _timings(run: RunRecord) -> dict[str, str]:
-    found = {}
-    for stage, seconds in run.seconds().items():
-        count = len(run.rows[stage])
-        found[f"{stage} steps"] = f"{duration(seconds)} ({count} steps, {seconds / max(count, 1):.2f} s each)"
-    if isinstance(run.metrics.get("seconds"), int | float):
-        found["last session, pictures and exports included"] = duration(run.metrics["seconds"])
     return found
 
 
