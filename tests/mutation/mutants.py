@@ -46,6 +46,7 @@ class Mutant:
         line: of the module, where it is.
         before: the replaced expression or statement ...
         after: ... and what stands in its place, "" for nothing.
+        place: the first line of the statement around it.
         source: of the whole module.
     """
 
@@ -53,10 +54,11 @@ class Mutant:
     line: int
     before: str
     after: str
+    place: str
     source: str
 
     def __str__(self) -> str:
-        return f"{self.line}: {self.kind}: {_short(self.before)}  ->  {_short(self.after) or '(nothing)'}"
+        return f"{self.line}: {_short(self.before)}  ->  {_short(self.after) or '(nothing)'}  in  {_short(self.place)}"
 
 
 def mutants(source: str) -> list[Mutant]:
@@ -64,13 +66,20 @@ def mutants(source: str) -> list[Mutant]:
     tree = ast.parse(source)
     found = []
     for place, kind, new in _changes(tree):
-        old = place.node
+        old, around = place.node, ast.unparse(place.statement).splitlines()[0]
+        before, after = ast.unparse(old), "" if isinstance(new, ast.Pass) else ast.unparse(new)
+        if kind == "keyword":
+            before, after = _left_out(old, new), "its default"
         place.put(new)
         whole = f"{ast.unparse(ast.fix_missing_locations(tree))}\n{MARK} = True\n"
         place.put(old)
-        after = "" if isinstance(new, ast.Pass) else ast.unparse(new)
-        found.append(Mutant(kind, getattr(old, "lineno", 0), ast.unparse(old), after, whole))
+        found.append(Mutant(kind, getattr(old, "lineno", 0), before, after, around, whole))
     return found
+
+
+def _left_out(old: ast.AST, new: ast.AST) -> str:
+    assert isinstance(old, ast.Call) and isinstance(new, ast.Call)
+    return ast.unparse(next(keyword for keyword in old.keywords if keyword not in new.keywords))
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,8 @@ class _Place:
     parent: ast.AST
     field: str
     index: int | None
+    statement: ast.AST
+    """The innermost around it, or itself."""
 
     @property
     def node(self) -> ast.AST:
@@ -93,8 +104,10 @@ class _Place:
             getattr(self.parent, self.field)[self.index] = node
 
 
-def _changes(parent: ast.AST, bound: frozenset[str] = frozenset()) -> Iterator[tuple[_Place, str, ast.AST]]:
-    """The replacements below a node; `bound` are names that have a value there."""
+def _changes(
+    parent: ast.AST, bound: frozenset[str] = frozenset(), statement: ast.AST | None = None
+) -> Iterator[tuple[_Place, str, ast.AST]]:
+    """The replacements below a node; `bound` are names that have a value there, `statement` is what it is part of."""
     if isinstance(parent, ast.FunctionDef):
         bound = frozenset(argument.arg for argument in [*parent.args.args, *parent.args.kwonlyargs])
     for name, value in ast.iter_fields(parent):
@@ -103,7 +116,8 @@ def _changes(parent: ast.AST, bound: frozenset[str] = frozenset()) -> Iterator[t
         for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
             if not isinstance(node, ast.AST) or _is_left_alone(node):
                 continue
-            place = _Place(parent, name, index)
+            around = node if isinstance(node, ast.stmt) else statement or node
+            place = _Place(parent, name, index, around)
             tested = isinstance(parent, ast.If | ast.IfExp | ast.While) and name == "test" or name == "ifs"
             if tested and not _is_negated_anyhow(node):
                 yield place, "condition", ast.UnaryOp(ast.Not(), node)
@@ -111,7 +125,7 @@ def _changes(parent: ast.AST, bound: frozenset[str] = frozenset()) -> Iterator[t
                 yield place, kind, ast.copy_location(new, node)
             if isinstance(node, _REMOVABLE) or isinstance(node, ast.Assign) and _can_go(node, bound):
                 yield place, "statement", ast.copy_location(ast.Pass(), node)
-            yield from _changes(node, bound)
+            yield from _changes(node, bound, around)
             if isinstance(node, ast.Assign):
                 bound = bound | _names(node)
 
