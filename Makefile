@@ -40,7 +40,8 @@ demo: $(STAMP) llvm
 	@echo "look at $(OUT)/images/appearance.png, or open $(OUT)/report.html; $(OUT)/export/asset.glb opens in Blender"
 
 test: $(STAMP) llvm
-	$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	@# Compiled files spare the processes that tests start a third of a second each.
+	PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 fuzz: $(STAMP) llvm
 	$(PY) tests/fuzz/fuzzer.py -n $(N) --seed $(SEED) --workers 2 --refusals vague

@@ -17,6 +17,7 @@ from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, Guida
 ROOT = Path(__file__).parents[2]
 SCENE = ROOT / "scenes" / "cat" / "scene.xml"
 TINY = ["geometry.steps=3", "appearance.steps=2", "output.turntable_frames=2", "output.texture_size=64"]
+TINY += ["output.faces=1000"]
 
 
 class Darker:

@@ -19,7 +19,8 @@ FEW = ["figure.glb", "duck.stl"]
 REST = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name not in FEW]
 SMALL = [
     "geometry.steps=2", "appearance.steps=2", "output.turntable_frames=2", "output.turntable_size=32",
-    "output.texture_size=64", "output.picture_size=0", "geometry.lambda_sds=0", "appearance.lambda_sds=0",
+    "output.texture_size=64", "output.faces=1000", "output.picture_size=0", "geometry.lambda_sds=0",
+    "appearance.lambda_sds=0",
 ]  # fmt: skip
 
 

@@ -23,6 +23,7 @@ SMALLER = [
     "output.turntable_size=32",
     "output.picture_size=0",
     "output.texture_size=64",
+    "output.faces=1000",
 ]
 
 

@@ -43,7 +43,7 @@ CHOSEN = [
     "appearance.losses.grey.lambda=0.1",
 ]
 TINY = ["geometry.steps=2", "appearance.steps=2", "output.turntable_frames=2", "output.texture_size=64"]
-TINY += ["output.picture_size=0"]
+TINY += ["output.picture_size=0", "output.faces=1000"]
 
 
 def examples() -> list[str]:

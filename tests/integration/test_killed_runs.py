@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tiny_runs import BOTH_STAGES_OUTPUT, FIELD, ORANGE_PART, TEXTURE, run_words, start_words, write_place
+from warm_runs import WarmRun, start_warm
 
 SETTINGS = (
     FIELD
@@ -46,14 +47,14 @@ def place(tmp_path_factory: pytest.TempPathFactory, animal: tuple[np.ndarray, np
     return write_place(tmp_path_factory.mktemp("killed"), animal, SETTINGS, part=ORANGE_PART)
 
 
-def start(place: Path, output: str, *more: str) -> subprocess.Popen[str]:
-    return start_words(run_words(place, output, *more))
+def start(place: Path, output: str, *more: str) -> WarmRun:
+    return start_warm(run_words(place, output, *more))
 
 
 def finish(place: Path, output: str, *more: str) -> float:
-    """Run to the end; the seconds that it took."""
+    """Run to the end, imports among it; the seconds that it took."""
     started = time.monotonic()
-    process = start(place, output, *more)
+    process = start_words(run_words(place, output, *more))
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     return time.monotonic() - started
@@ -94,7 +95,7 @@ def kill_until_done(place: Path, whole: tuple[dict[str, bytes], float], kills: i
         output, number = f"run{number}", number + 1
         more: tuple[str, ...] = ()
         while done < kills:
-            process = start(place, output, *more)
+            process = start_words(run_words(place, output, *more))
             try:
                 process.communicate(timeout=generator.uniform(0, 1.1 * seconds))
                 assert process.returncode == 0
@@ -150,7 +151,8 @@ def test_interrupted_while_it_bakes_or_exports(place: Path, waited_for: str) -> 
     assert "Traceback" not in errors
     metrics = place / output / "metrics.json"
     assert not metrics.exists() or "stages" not in json.loads(metrics.read_text())
-    finish(place, output, "--resume", *more)
+    resumed = start(place, output, "--resume", *more)
+    assert resumed.communicate(timeout=600) and resumed.returncode == 0
     assert set(json.loads(metrics.read_text())["stages"].values()) == {"done"}
     assert (place / output / "export" / "asset.glb").is_file()
 

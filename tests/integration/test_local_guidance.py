@@ -157,7 +157,7 @@ def test_an_inpainting_step_equals_the_pipelines_own(folders: dict[str, Path], m
         output_type="latent",
     ).images
     texts = {"text": guidance._embed(["a horse with wings"]), "plain": guidance._embed(["blurry"])}
-    condition = guidance.seen_around(views.base, guidance._holes(views), "refined")
+    condition = guidance.conditions.seen_around(views.base, guidance.conditions.holes(views), "refined")
     with torch.no_grad():
         seen = guidance.predict_noise(z_t, t, texts, condition)
     noise = seen["plain"] + 7.5 * (seen["text"] - seen["plain"])

@@ -13,9 +13,10 @@ from tiny_pipelines import save_pipeline
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance import loading
-from fd_mitsuba.guidance.diffusion import DiffusionGuidance, _generator
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
+from fd_mitsuba.guidance.step_draws import step_generator
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def test_an_augmented_step_is_a_plain_one_of_turned_normals(folders: dict[str, P
     plain = load(folders[kind], guidance_scale=7.5)
     augmented = load(folders[kind], guidance_scale=7.5, normal_augmentation="rotation_flip")
     views = views_for(plain, "coarse")
-    turns = random_turns(2, "rotation_flip", _generator(3, 0, "coarse", 1))
+    turns = random_turns(2, "rotation_flip", step_generator(3, 0, "coarse", 1))
     inside = replace(
         views,
         pictures=turned(views.pictures.detach(), turns).requires_grad_(),

@@ -21,6 +21,7 @@ import trimesh
 from PIL import Image
 from tiny_pipelines import save_pipeline
 from tiny_runs import FIELD, run_words, start_words, write_place
+from warm_runs import WarmRun, start_warm
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
@@ -51,6 +52,7 @@ checkpoint_every = 4
 turntable_frames = 3
 turntable_size = 32
 picture_size = 0
+faces = 1000
 """
 )
 STEPS = 6
@@ -72,13 +74,11 @@ def arguments(place: Path, output: str, *more: str) -> list[str]:
     return run_words(place, output, "--set", model, "--stage", "geometry", *more)
 
 
-def start(place: Path, output: str, *more: str) -> subprocess.Popen[str]:
-    return start_words(arguments(place, output, *more), HF_HUB_OFFLINE="1", XDG_CACHE_HOME=str(place / "cache"))
-
-
 @contextlib.contextmanager
-def started(place: Path, output: str, *more: str) -> Iterator[subprocess.Popen[str]]:
-    process = start(place, output, *more)
+def started(place: Path, output: str, *more: str, cold: bool = False) -> Iterator[subprocess.Popen[str] | WarmRun]:
+    """A run that ends with the block; `cold`: imports are a part of it."""
+    start = start_words if cold else start_warm
+    process = start(arguments(place, output, *more), HF_HUB_OFFLINE="1", XDG_CACHE_HOME=str(place / "cache"))
     try:
         yield process
     finally:
@@ -87,9 +87,9 @@ def started(place: Path, output: str, *more: str) -> Iterator[subprocess.Popen[s
         process.communicate(timeout=60)
 
 
-def finish(place: Path, output: str, *more: str) -> str:
+def finish(place: Path, output: str, *more: str, cold: bool = False) -> str:
     """Run to the end and return what it said on stderr."""
-    with started(place, output, *more) as process:
+    with started(place, output, *more, cold=cold) as process:
         _, errors = process.communicate(timeout=120)
         assert process.returncode == 0, errors
     return errors
@@ -99,7 +99,7 @@ def rows(folder: Path) -> list[int]:
     return [row["step"] for row in read_metrics(folder / "metrics.jsonl")]
 
 
-def wait_for(process: subprocess.Popen[str], condition: Callable[[], Any]) -> None:
+def wait_for(process: subprocess.Popen[str] | WarmRun, condition: Callable[[], Any]) -> None:
     deadline = time.monotonic() + 90
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -116,7 +116,7 @@ def last_bytes(folder: Path, step: int) -> bytes:
 @pytest.fixture(scope="module")
 def finished(place: Path) -> Path:
     """The run folder of a whole run with the SD-1.5-shaped pipeline, one thread."""
-    finish(place, "whole")
+    finish(place, "whole", cold=True)
     return place / "whole"
 
 
@@ -214,9 +214,10 @@ def kill_and_resume(place: Path, output: str, kills: int, seed: int) -> None:
     folder, generator = place / output, random.Random(seed)
     for attempt in range(kills):
         resume = ("--resume",) if attempt else ()
-        with started(place, output, *resume, *LONG) as process:
-            if attempt % 4 == 3:
-                time.sleep(generator.uniform(0, 8))  # anywhere: imports, the first writes, the loop
+        anywhere = attempt % 4 == 3
+        with started(place, output, *resume, *LONG, cold=anywhere) as process:
+            if anywhere:
+                time.sleep(generator.uniform(0, 8))  # in the imports, the first writes, the loop
             else:
                 before = rows(folder)
                 wait_for(process, lambda before=before: rows(folder) != before)
@@ -263,7 +264,7 @@ def test_second_signal_ends_at_once_and_can_be_resumed(place: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_before_the_first_step(place: Path, number: signal.Signals) -> None:
     output = f"early_{number.name}"
-    with started(place, output) as process:
+    with started(place, output, cold=True) as process:
         time.sleep(random.uniform(0.6, 2.5))  # among the imports
         assert not (place / output / "metrics.jsonl").exists()
         process.send_signal(number)

@@ -31,6 +31,7 @@ turntable_frames = 2
 turntable_size = 32
 picture_size = 32
 texture_size = 32
+faces = 1000
 """
 ORANGE_PART = PART.replace("<float", '<rgb name="base_color" value="0.8, 0.3, 0.1"/><float')
 

@@ -35,6 +35,7 @@ def test_the_jitter_is_normal_and_its_seed_decides():
     points = torch.zeros(50_000, 3)
     delta = jittered(points, 0.02, torch.Generator().manual_seed(3))
     assert torch.equal(delta, jittered(points, 0.02, torch.Generator().manual_seed(3)))
+    assert jittered(points.half(), 0.02, torch.Generator()).dtype == torch.float16
     assert delta.std().item() == pytest.approx(0.02, rel=0.02) and abs(delta.mean().item()) < 2e-4
     within = (delta.abs() < 0.02).double().mean().item()
     assert within == pytest.approx(math.erf(1 / math.sqrt(2)), abs=0.01)

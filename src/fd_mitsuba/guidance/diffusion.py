@@ -8,9 +8,7 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
@@ -23,15 +21,16 @@ from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.conditions import Conditions
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import own_device, require_device
-from fd_mitsuba.guidance.inpainting import masked_base, repaint_mask
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
 from fd_mitsuba.guidance.picture_latents import PictureLatents
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
+from fd_mitsuba.guidance.step_draws import drawn_timesteps, own_share, step_generator
 from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation
 
 MASK_THRESHOLD = 0.1
@@ -65,6 +64,7 @@ class DiffusionGuidance(Denoiser):
         self.view_grid = components.conventions.view_grid
         self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
+        self.conditions = Conditions(self.latents, config, self.view_grid, self.device, components.folder)
         self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self._prompt: str | None = None
         self._negative_prompt = ""
@@ -156,8 +156,8 @@ class DiffusionGuidance(Denoiser):
             raise ValueError(f"the {phase} phase takes pictures of {wanted} x {wanted}, not {size} x {size}")
         pictures, shown = views.pictures, views.base
         if phase == "coarse" and self.config.normal_augmentation != "none":
-            share, total = _share(views)
-            generator = _generator(seed, step, phase, 1)
+            share, total = own_share(views)
+            generator = step_generator(seed, step, phase, 1)
             turns = random_turns(total, self.config.normal_augmentation, generator)[share]
             pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
         images, base = self._images(pictures, shown, phase)
@@ -189,6 +189,10 @@ class DiffusionGuidance(Denoiser):
         """Scaled latents z (N, 4, L, L) of pictures or mosaics; see `PictureLatents`. Gradients flow."""
         return self.latents(images, phase)
 
+    def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
+        """The base's latents as a network with 8 input channels sees them; see `Conditions.seen_base`."""
+        return self.conditions.seen_base(base, phase)
+
     def _distil(
         self,
         images: Tensor,
@@ -200,12 +204,12 @@ class DiffusionGuidance(Denoiser):
         mask: Tensor | None = None,
     ) -> GuidanceResult:
         self.looks_at_picture = phase == "appearance"
-        how, count, (_, total) = self._how(phase), len(images), _share(views)
+        how, count, (_, total) = self._how(phase), len(images), own_share(views)
         total //= self.view_grid**2
         texts = self.embeddings(self.prompts(views), self.passes(how))
         areas = self._areas(views, self.passes(how))
-        holes = self._holes(views) if self.inpaints else None
-        control = self._control(views)
+        holes = self.conditions.holes(views) if self.inpaints else None
+        control = self.conditions.control(views, self.control_sees)
         rows_per_chunk = max(1, self.config.views_per_call // len(texts))
         track = images.requires_grad and torch.is_grad_enabled()
 
@@ -220,7 +224,9 @@ class DiffusionGuidance(Denoiser):
                 noise=noise[rows],
                 timesteps=timesteps[rows],
                 texts={name: embedding[rows] for name, embedding in texts.items()},
-                condition=self._condition(base, holes, rows, phase),
+                condition=self.conditions.beside_latents(
+                    None if base is None else base[rows], None if holes is None else holes[rows], phase
+                ),
                 mask=None if mask is None else mask[rows],
                 areas=tuple(area.rows(rows) for area in areas),
                 control=None if control is None else control[rows],
@@ -304,51 +310,11 @@ class DiffusionGuidance(Denoiser):
             return images, None
         return images, tile_views(base, self.view_grid).to(self.device).detach()
 
-    def _condition(self, base: Tensor | None, holes: Tensor | None, rows: slice, phase: Phase) -> Tensor | None:
-        """What the network sees of the base beside z_t, for some of the pictures."""
-        if base is None:
-            return None
-        return self.seen_base(base[rows], phase) if holes is None else self.seen_around(base[rows], holes[rows], phase)
-
-    @torch.no_grad()
-    def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
-        """The base's latents (N, 4, L, L) as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
-        return self.latents.unscaled(self.encode(base, phase))
-
-    @torch.no_grad()
-    def seen_around(self, base: Tensor, holes: Tensor, phase: Phase) -> Tensor:
-        """(N, 5, L, L) as inpainting models take it: the holes, and the scaled latents of the base without them.
-
-        Args:
-            holes: (N, 1, L, L), 1 where the model is to paint, 0 elsewhere.
-        """
-        return torch.cat(
-            [holes, self.encode(masked_base(base, holes, phase, self.latents.empty_mask(phase)), phase)], dim=1
-        )
-
-    def _control(self, views: GuidanceViews | AppearanceViews) -> Tensor | None:
-        """(N, 3, H, H) for the ControlNet at the size of the VAE's input; None in the geometry stage."""
-        if self.control_sees is None or not isinstance(views, AppearanceViews):
-            return None
-        if views.control is None:
-            raise ValueError(f"the ControlNet needs the surface's {self.control_sees} of the same views")
-        return self.latents.resized(tile_views(views.control.detach(), self.view_grid).to(self.device).float())
-
-    def _holes(self, views: GuidanceViews | AppearanceViews) -> Tensor:
-        if not views.regions:
-            raise UserError(
-                f"{self.components.folder}: an inpainting model (9 input channels) is told by a mask what to paint, "
-                "and the views come without one; give GuidanceViews.regions"
-            )
-        part_mask = views.part_mask if isinstance(views, AppearanceViews) else None
-        margin = self.config.mask_margin
-        return repaint_mask(views.regions, part_mask, self.view_grid, self.latent_size, margin).to(self.device)
-
     def _draw_for(
         self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
     ) -> tuple[Tensor, Tensor]:
         """`_draw` for these of the step's views."""
-        share, total = _share(views)
+        share, total = own_share(views)
         grid = self.view_grid**2
         timesteps, noise = self._draw(total // grid, step, steps_total, phase, seed)
         own = slice(share.start // grid, share.stop // grid)
@@ -356,13 +322,10 @@ class DiffusionGuidance(Denoiser):
 
     def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
         """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
-        generator = _generator(seed, step, phase)
-        config, bounds = self.config, self._how(phase).timestep_range
-        progress, levels = min(step / max(steps_total - 1, 1), 1.0), len(self.alpha_bars)
-        if config.timestep_annealing == "none":
-            timesteps = sds.draw_timesteps(bounds, levels, count, generator)
-        else:
-            timesteps = sds.scheduled_timesteps(bounds, levels, count, config.timestep_annealing, progress)
+        generator = step_generator(seed, step, phase)
+        progress = min(step / max(steps_total - 1, 1), 1.0)
+        bounds, levels = self._how(phase).timestep_range, len(self.alpha_bars)
+        timesteps = drawn_timesteps(self.config, bounds, levels, count, progress, generator)
         noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
         return timesteps.to(self.device), noise.to(self.device)
 
@@ -374,20 +337,6 @@ class DiffusionGuidance(Denoiser):
                 f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
                 "lower guidance.guidance_scale"
             )
-
-
-def _generator(seed: int, step: int, phase: Phase, *purpose: int) -> torch.Generator:
-    """Random numbers of a step; each purpose beside t and the noise has its own."""
-    key = np.random.SeedSequence((seed, step, get_args(Phase).index(phase), *purpose))
-    return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> 1))
-
-
-def _share(views: GuidanceViews | AppearanceViews) -> tuple[slice, int]:
-    """Which of the step's views these are, and how many there are in all processes."""
-    own = len(views.pictures)
-    if views.share is None:
-        return slice(0, own), own
-    return views.share, own * processes().count
 
 
 def _scale_of_all(gradient: Tensor, mask: Tensor | None) -> float:
