@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.runs.check import CheckReport, check_scene
+from fd_mitsuba.runs.check import check_scene
+from fd_mitsuba.runs.check_report import CheckReport
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
