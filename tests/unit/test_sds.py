@@ -52,6 +52,10 @@ def test_every_prediction_type_gives_back_the_noise() -> None:
     torch.testing.assert_close(sds.clean_estimate(z_t, noise, abar), z, rtol=1e-3, atol=1e-4)
 
 
+def test_without_any_signal_the_clean_estimate_is_large_and_finite() -> None:
+    assert sds.clean_estimate(latents(3), latents(1), torch.zeros(1)).item() == pytest.approx(2e6)
+
+
 def test_one_scale_guidance() -> None:
     predictions = {"text": latents(3), "plain": latents(1)}
     combined = sds.combine(predictions, sds.cfg_coefficients(7.5))
