@@ -1,6 +1,7 @@
-"""The method `voxe_global`: Vox-E without its refinement (arXiv 2303.12048), on normals and coverage.
+"""The methods `voxe_global` and `voxe`: Vox-E without and with its refinement (arXiv 2303.12048), on normals.
 
-A ReLU-field voxel grid is fitted to images of the base, and a copy of it is guided as a whole.
+A ReLU-field voxel grid is fitted to images of the base, and a copy of it is guided as a whole. The refinement keeps of
+that what belongs to the edit, by the attention of the model to its words and a graph cut.
 """
 
 from __future__ import annotations
@@ -8,19 +9,32 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+import torch
 from pydantic import Field
+from torch import Tensor
 
-from fd_mitsuba.baselines.interface import BASELINES, EditTask
+from fd_mitsuba.baselines.image_editors.by_prior import single_view_prompts
+from fd_mitsuba.baselines.interface import BASELINES, EditTask, mesh_images
+from fd_mitsuba.baselines.voxels.attention import recorded_attention, split_words, token_places, word_maps
 from fd_mitsuba.baselines.voxels.edit_stage import VoxelEditStage
 from fd_mitsuba.baselines.voxels.edited import EditedVoxels
 from fd_mitsuba.baselines.voxels.fitting import BaseRays, fit_cameras, fit_grid, fit_psnr
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid
+from fd_mitsuba.baselines.voxels.refinement import CutSettings, as_large, attention_grids, edit_voxels, merged
+from fd_mitsuba.baselines.voxels.rendering import render_normals
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import Points, Rate, Samples, Steps, Views, Weight
+from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.runs.own_meshes import base_mesh
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.seeds import Purpose, seed_for
+
+ATTENTION_SIDE, ATTENTION_SIZE = 16, 64
+"""Side of the attention layers that count, and of the images that attention grids are fitted to."""
 
 
 class VoxeGlobalSettings(Section):
@@ -68,3 +82,97 @@ def voxe_global(settings: VoxeGlobalSettings, task: EditTask) -> EditedVoxels:
     edited = EditedVoxels(task.scene, stage.field, {"fit_psnr_db": psnr})
     edited.guidance_calls = stage.steps
     return edited
+
+
+class VoxeSettings(VoxeGlobalSettings):
+    """Of `voxe`."""
+
+    edit_word: str = ""
+    """The prompt's word for what is new; none: the words that the base prompt has not."""
+    attention_views: Views = 24
+    """Views whose attention is recorded."""
+    attention_time: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """The noise level at which it is, as a share of all timesteps; the original's."""
+    attention_steps: Steps = 200
+    """Steps of the fit of the attention grids."""
+    lambda_tv: Weight = 0.01
+    """Weight of their total variation; the original's."""
+    cut_cost: Weight = 5.0
+    """Cost of parting two equal neighbours; the original's."""
+    cut_sigma: Annotated[float, Field(gt=0, le=100)] = 0.1
+    """How fast that falls with the difference of their features; the original's."""
+
+
+@BASELINES.register("voxe", VoxeSettings)
+def voxe(settings: VoxeSettings, task: EditTask) -> EditedVoxels:
+    """Vox-E: as `voxe_global`, then only voxels that the attention to the edit's words marks stay edited."""
+    words = split_words(task.scene.prompt, task.scene.base_prompt, settings.edit_word)
+    refuse_without_attention(task)
+    base, psnr = fitted_grid(settings, task.scene, task.config.seed)
+    stage = VoxelEditStage(task.own, base, settings.samples, settings.learning_rate, settings.lambda_correlation)
+    run_stage(stage, task.folder, True, task.quiet, task.say)
+    cameras = fit_cameras(settings.attention_views, np.zeros(3))
+    maps = as_large(attention_maps(task, stage.field, cameras, words, settings), ATTENTION_SIZE)
+    values = attention_grids(stage.field, maps, cameras, settings.samples, settings.attention_steps, settings.lambda_tv)
+    cut = CutSettings(settings.cut_cost, settings.cut_sigma, seed_for(task.config.seed, Purpose.SAMPLES))
+    edit = edit_voxels(stage.field, values, cut)
+    share = float(edit.sum()) / max(float((stage.field.density > 0).sum()), 1.0)
+    edited = EditedVoxels(task.scene, merged(stage.field, base, edit), {"fit_psnr_db": psnr, "edited_share": share})
+    edited.guidance_calls = stage.steps + settings.attention_views
+    return edited
+
+
+def refuse_without_attention(task: EditTask) -> DiffusionGuidance:
+    """The task's guidance; UserError where it has no cross-attention to look at."""
+    guidance = task.guidance.inner
+    if not isinstance(guidance, DiffusionGuidance) or guidance.inpaints:
+        raise UserError(
+            f"guidance.model = {task.config.guidance.source}: voxe needs a diffusion model that sees the whole image; "
+            "take voxe_global instead"
+        )
+    return guidance
+
+
+@torch.no_grad()
+def attention_maps(
+    task: EditTask,
+    grid: VoxelGrid,
+    cameras: CameraBatch,
+    words: tuple[list[str], list[str]],
+    settings: VoxeSettings,
+) -> Tensor:
+    """(N, 2, 16, 16) attention to the words of the edit and of the object, in single views of the edited grid.
+
+    Raises:
+        UserError: the guidance is no diffusion model, or does not read the edit's words.
+    """
+    guidance = refuse_without_attention(task)
+    phase = task.own.phase_of(max(task.own.steps - 1, 0))[0]
+    size = guidance.latent_size if phase == "coarse" else guidance.latents.picture_side
+    space = task.config.geometry.normal_space
+    normal, mask = render_normals(grid, cameras, size, settings.samples, space=space)
+    known = mesh_images(base_mesh(task.scene), cameras, size)
+    prompts = single_view_prompts(guidance, cameras)
+    level = round(settings.attention_time * (len(guidance.alpha_bars) - 1))
+    generator = torch.Generator().manual_seed(seed_for(task.config.seed, Purpose.GUIDANCE))
+    noise = torch.randn(1, 4, guidance.latent_size, guidance.latent_size, generator=generator).to(guidance.device)
+    tokenizer, rows = guidance.components.tokenizer, []
+    for view, text in enumerate(prompts):
+        groups = [token_places(tokenizer, text, some) for some in words]
+        if not groups[0]:
+            raise UserError(
+                f"the guidance model reads {text!r}, in which {', '.join(words[0])} is not; name a word of it with "
+                "edit_word"
+            )
+        groups[1] = groups[1] or [at for at in range(1, len(tokenizer(text).input_ids) - 1) if at not in groups[0]]
+        few = slice(view, view + 1)
+        shown = torch.cat([normal[few], mask[few], mask[few]], dim=1).to(guidance.device)
+        base = torch.cat([known.values[few], known.mask[few], known.mask[few]], dim=1).to(guidance.device)
+        z_t = sds.add_noise(guidance.encode(shown, phase), noise, guidance.alpha_bars[[level]])
+        condition = guidance.seen_base(base, phase) if guidance.has_image_pass else None
+        # One view at a time: several threads would mix up whose attention is whose.
+        with recorded_attention(guidance.components.unet) as maps:
+            texts = guidance.embeddings([text], ("text",))
+            guidance.predict_noise(z_t.float(), torch.tensor([level], device=guidance.device), texts, condition)
+        rows.append(word_maps(maps, groups, ATTENTION_SIDE))
+    return torch.stack(rows)
