@@ -91,8 +91,13 @@ class PriorEdit(EditedViews):
         return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
 
 
-def single_view_prompts(guidance: DiffusionGuidance, cameras: CameraBatch) -> list[str]:
-    """The text of each view, as the guidance words it for the first view of a mosaic."""
+def single_view_prompts(guidance: DiffusionGuidance, cameras: CameraBatch, text: str | None = None) -> list[str]:
+    """The text of each view, as the guidance words it for the first view of a mosaic.
+
+    Args:
+        text: in place of the guidance's prompt.
+    """
     every = guidance.view_grid**2
     azimuths, elevations = (np.repeat(angles, every) for angles in (cameras.azimuth_deg, cameras.elevation_deg))
-    return guidance.prompts(GuidanceViews(torch.zeros(len(azimuths), 5, 1, 1), None, azimuths, elevations))
+    views = GuidanceViews(torch.zeros(len(azimuths), 5, 1, 1), None, azimuths, elevations)
+    return guidance.prompts(views, text)
