@@ -6,40 +6,35 @@ that what belongs to the edit, by the attention of the model to its words and a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from fd_mitsuba.baselines.image_editors.by_prior import single_view_prompts
-from fd_mitsuba.baselines.interface import BASELINES, EditTask, mesh_images
-from fd_mitsuba.baselines.voxels.attention import recorded_attention, split_words, token_places, word_maps
+from fd_mitsuba.baselines.edit_maps import (
+    DRAWS,
+    attention_maps,
+    difference_maps,
+    looked_at,
+    refuse_without_attention,
+)
+from fd_mitsuba.baselines.interface import BASELINES, EditTask
+from fd_mitsuba.baselines.voxels.attention import split_words
 from fd_mitsuba.baselines.voxels.edit_stage import VoxelEditStage
 from fd_mitsuba.baselines.voxels.edited import EditedVoxels
 from fd_mitsuba.baselines.voxels.fitting import BaseRays, fit_cameras, fit_grid, fit_psnr
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid
 from fd_mitsuba.baselines.voxels.refinement import CutSettings, as_large, attention_grids, edit_voxels, merged
-from fd_mitsuba.baselines.voxels.rendering import render_normals
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import Points, Rate, Samples, Steps, Views, Weight
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.runs.own_meshes import base_mesh
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.seeds import Purpose, seed_for
 
-ATTENTION_SIDE, ATTENTION_SIZE = 16, 64
-"""Side of the attention layers that count, and of the images that attention grids are fitted to."""
-DRAWS = 2
-"""Of noise, for a map of differences."""
-_OUTLIERS = 0.99
+MAP_SIZE = 64
+"""Pixels a side of the images that attention grids are fitted to."""
 
 
 class VoxeGlobalSettings(Section):
@@ -120,12 +115,13 @@ def voxe(settings: VoxeSettings, task: EditTask) -> EditedVoxels:
     stage = VoxelEditStage(task.own, base, settings.samples, settings.learning_rate, settings.lambda_correlation)
     run_stage(stage, task.folder, True, task.quiet, task.say)
     cameras = fit_cameras(settings.attention_views, np.zeros(3))
+    seen = looked_at(task, stage.field, cameras, settings.samples, settings.attention_time)
     if by_words:
-        maps = attention_maps(task, stage.field, cameras, words, settings)
+        maps = attention_maps(task, seen, cameras, words)
         maps = maps / maps.amax(dim=(0, 2, 3), keepdim=True).clamp(min=1e-12)
     else:
-        maps = difference_maps(task, stage.field, cameras, settings)
-    maps = as_large(maps, ATTENTION_SIZE)
+        maps = difference_maps(task, seen, cameras)
+    maps = as_large(maps, MAP_SIZE)
     values = attention_grids(stage.field, maps, cameras, settings.samples, settings.attention_steps, settings.lambda_tv)
     cut = CutSettings(settings.cut_cost, settings.cut_sigma, seed_for(task.config.seed, Purpose.SAMPLES))
     edit = edit_voxels(stage.field, values, cut)
@@ -142,114 +138,3 @@ def looks_for_words(task: EditTask, settings: VoxeSettings) -> bool:
     if not by_words and not task.scene.base_prompt:
         raise UserError(f"{task.scene.path}: has no base_prompt, which voxe compares the prompt with; add one")
     return by_words
-
-
-def refuse_without_attention(task: EditTask) -> DiffusionGuidance:
-    """The task's guidance; UserError where it has no cross-attention to look at."""
-    guidance = task.guidance.inner
-    if not isinstance(guidance, DiffusionGuidance) or guidance.inpaints:
-        raise UserError(
-            f"guidance.model = {task.config.guidance.source}: voxe needs a diffusion model that sees the whole image; "
-            "take voxe_global instead"
-        )
-    return guidance
-
-
-@dataclass(frozen=True)
-class LookedAt:
-    """Single views of an edited grid as the network is given them.
-
-    Attributes:
-        z: (N, 4, L, L) latents of the views; condition: what it sees of the base beside them, or None.
-        level: the timestep.
-    """
-
-    z: Tensor
-    condition: Tensor | None
-    level: int
-
-    def noised(self, guidance: DiffusionGuidance, seed: int) -> Tensor:
-        """The latents with noise, the same for every view."""
-        noise = torch.randn(1, *self.z.shape[1:], generator=torch.Generator().manual_seed(seed)).to(self.z.device)
-        return sds.add_noise(self.z, noise.expand_as(self.z), guidance.alpha_bars[[self.level] * len(self.z)]).float()
-
-    def some(self, rows: slice) -> LookedAt:
-        """Some of the views."""
-        return LookedAt(self.z[rows], None if self.condition is None else self.condition[rows], self.level)
-
-
-@torch.no_grad()
-def looked_at(task: EditTask, grid: VoxelGrid, cameras: CameraBatch, settings: VoxeSettings) -> LookedAt:
-    """The views of `cameras`, each as one image of the network's full size."""
-    guidance = refuse_without_attention(task)
-    phase = task.own.phase_of(max(task.own.steps - 1, 0))[0]
-    size = guidance.latent_size if phase == "coarse" else guidance.latents.picture_side
-    normal, mask = render_normals(grid, cameras, size, settings.samples, space=task.config.geometry.normal_space)
-    known = mesh_images(base_mesh(task.scene), cameras, size)
-    shown = torch.cat([normal, mask, mask], dim=1).to(guidance.device)
-    base = torch.cat([known.values, known.mask, known.mask], dim=1).to(guidance.device)
-    rows, seen = [], []
-    for view in range(len(cameras)):
-        few = slice(view, view + 1)
-        rows.append(guidance.encode(shown[few], phase))
-        if guidance.has_image_pass:
-            seen.append(guidance.seen_base(base[few], phase))
-    level = round(settings.attention_time * (len(guidance.alpha_bars) - 1))
-    return LookedAt(torch.cat(rows), torch.cat(seen) if seen else None, level)
-
-
-@torch.no_grad()
-def attention_maps(
-    task: EditTask, grid: VoxelGrid, cameras: CameraBatch, words: tuple[list[str], list[str]], settings: VoxeSettings
-) -> Tensor:
-    """(N, 2, 16, 16) attention to the words of the edit and of the object, in single views of the edited grid.
-
-    Raises:
-        UserError: the guidance is no diffusion model, or does not read the edit's words.
-    """
-    guidance, seen = refuse_without_attention(task), looked_at(task, grid, cameras, settings)
-    z_t = seen.noised(guidance, seed_for(task.config.seed, Purpose.GUIDANCE))
-    tokenizer, rows = guidance.components.tokenizer, []
-    for view, text in enumerate(single_view_prompts(guidance, cameras)):
-        groups = [token_places(tokenizer, text, some) for some in words]
-        if not groups[0]:
-            raise UserError(
-                f"the guidance model reads {text!r}, in which {', '.join(words[0])} is not; name a word of it with "
-                "edit_word"
-            )
-        groups[1] = groups[1] or [at for at in range(1, len(tokenizer(text).input_ids) - 1) if at not in groups[0]]
-        few = slice(view, view + 1)
-        texts, times = guidance.embeddings([text], ("text",)), torch.tensor([seen.level], device=guidance.device)
-        # One view at a time: several threads would mix up whose attention is whose.
-        with recorded_attention(guidance.components.unet) as maps:
-            guidance.predict_noise(z_t[few], times, texts, seen.some(few).condition)
-        rows.append(word_maps(maps, groups, ATTENTION_SIDE))
-    return torch.stack(rows)
-
-
-@torch.no_grad()
-def difference_maps(task: EditTask, grid: VoxelGrid, cameras: CameraBatch, settings: VoxeSettings) -> Tensor:
-    """(N, 2, L, L) where the network sees something else with the prompt than with the base prompt, and the rest.
-
-        d = mean over channels and draws of |e(prompt) - e(base prompt)|, smoothed, over its 99th percentile, at most 1
-
-    and 1 - d (DiffEdit, arXiv 2210.11427).
-    """
-    guidance, seen = refuse_without_attention(task), looked_at(task, grid, cameras, settings)
-    prompts, plain = (single_view_prompts(guidance, cameras, text) for text in (None, task.scene.base_prompt))
-    texts = {name: guidance.embeddings(some, ("text",))["text"] for name, some in (("text", prompts), ("plain", plain))}
-    rows = []
-    for view in range(len(cameras)):
-        few, found = slice(view, view + 1), torch.zeros(1)
-        for draw in range(DRAWS):
-            z_t = seen.some(few).noised(guidance, seed_for(task.config.seed, Purpose.GUIDANCE, draw))
-            times = torch.tensor([seen.level], device=guidance.device)
-            both = [
-                guidance.predict_noise(z_t, times, {"text": text[few]}, seen.some(few).condition)["text"]
-                for text in texts.values()
-            ]
-            found = found + (both[0] - both[1]).abs().mean(dim=1, keepdim=True).cpu()
-        rows.append(avg_pool2d(found, 5, stride=1, padding=2))
-    share = torch.cat(rows)
-    share = (share / torch.quantile(share, _OUTLIERS).clamp(min=1e-12)).clamp(max=1)
-    return torch.cat([share, 1 - share], dim=1)
