@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_pipelines import save_pipeline
 from tiny_runs import FIELD, write_place
 
 from fd_mitsuba.baselines import jobs as jobs_module
@@ -241,3 +242,43 @@ def test_bad_input_is_one_line(place: Path, tmp_path: Path, capsys: pytest.Captu
     assert main(["compare", str(place / "nowhere"), *words]) == 1
     assert "no such scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["builtin", "sd15", "sd21", "ip2p"])
+def test_three_steps_of_every_method_with_every_layout(
+    kind: str, scene: EditScene, place: Path, tmp_path: Path
+) -> None:
+    """Both phases where the model is a real one's layout; Vox-E's cut needs its cross-attention, too."""
+    model = "builtin" if kind == "builtin" else str(save_pipeline(kind, tmp_path / kind))
+    coarse = "1.0" if kind == "builtin" else "0.67"
+    overrides = [
+        f"guidance.model={model}",
+        "geometry.steps=3",
+        f"geometry.coarse_fraction={coarse}",
+        "geometry.views=4",
+    ]
+    config = RunConfig.load(place / "tiny.toml", overrides)
+    for name in ("fantasia3d", "voxe_global", "voxe"):
+        given = EditTask(scene, config, tmp_path / name, lambda line: None)
+        options = VOXELS if name == "voxe_global" else VOXELS | {"attention_views": 2} if name == "voxe" else {}
+        edited = BASELINES.make(Choice.of(name, options), "here", given)
+        # Two views whose attention is recorded, or two draws of noise for each.
+        extra = 0 if name != "voxe" else 4 if kind == "builtin" else 2
+        assert given.guidance.calls == 3 and edited.guidance_calls == 3 + extra
+        images = edited.images(VIEWS, 24)
+        assert images.values.isfinite().all() and images.mask.max() > 0.9
+    assert 0 < edited.fit["edited_share"] < 1
+    # What is not labelled is the base's again: less is changed than without the refinement.
+    base, _ = fitted_grid(VoxeGlobalSettings(**VOXELS), scene, 0)
+    same = (edited.grid.density == base.density).float().mean()
+    assert same > 0.5
+
+
+def test_a_guidance_without_attention_is_refused_before_anything_is_made(
+    scene: EditScene, place: Path, tmp_path: Path
+) -> None:
+    given = task(scene, place, tmp_path / "work")
+    with pytest.raises(UserError, match="needs a diffusion model"):
+        BASELINES.make(Choice.of("voxe", VOXELS), "here", given)
+    assert not (tmp_path / "work").exists() and given.guidance_calls == 0

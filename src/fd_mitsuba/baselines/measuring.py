@@ -60,9 +60,9 @@ def measure(edited: EditedObject, task: EditTask, judge: Judge, protocol: Compar
     scene, geometry = task.scene, task.config.geometry
     cameras = judged_cameras(protocol.views, np.zeros(3))
     images, base = (edited.images(cameras, protocol.size), edited.base_images(cameras, protocol.size))
-    features = [judge.images(shown_to(judge, found)) for found in (images, base)]
-    clip = clip_scores(judge, *features, EditPrompt(scene.prompt, scene.base_prompt))
-    faces = front_in_back(*features, cameras.azimuth_deg)
+    after, before = (judge.images(shown_to(judge, found)) for found in (images, base))
+    clip = clip_scores(judge, after, before, EditPrompt(scene.prompt, scene.base_prompt))
+    faces = front_in_back(after, before, cameras.azimuth_deg)
     band = geometry.focal_band
     outside = outside_regions(scene, cameras, protocol.size, band)
     consistency = view_consistency(images.mask, base.mask, cameras, scene.base_canonical)

@@ -82,7 +82,7 @@ def _film(points: np.ndarray, cameras: CameraBatch, view: int, size: int) -> np.
 
 def _cells(film: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     cell = np.floor(film).astype(np.int64)
-    seen = ((cell >= 0) & (cell < size)).all(axis=1)
+    seen = np.asarray(((cell >= 0) & (cell < size)).all(axis=1))
     return cell.clip(0, size - 1), seen
 
 

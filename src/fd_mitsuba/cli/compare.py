@@ -9,7 +9,7 @@ from pathlib import Path
 from fd_mitsuba.cli.options import definitions, machine_options, remark, say, start
 from fd_mitsuba.cli.scene_options import chosen_settings, settings_options
 
-_DEFAULT_METHODS = ["focaldreamer", "fantasia3d", "voxe_global"]
+_DEFAULT_METHODS = ["focaldreamer", "fantasia3d", "voxe_global", "voxe"]
 
 
 def add_compare_command(commands: argparse._SubParsersAction) -> None:

@@ -75,7 +75,7 @@ class PriorEdit(EditedViews):
         known = guidance.encode(pictures, "coarse")
         generator = torch.Generator().manual_seed(seed_for(self.task.config.seed, Purpose.GUIDANCE))
         noise = torch.randn(count, 4, side, side, generator=generator)
-        texts = guidance.embeddings(self._prompts(cameras), self._coefficients)
+        texts = guidance.embeddings(single_view_prompts(guidance, cameras), self._coefficients)
         inside = self.region_mask(cameras, side, self._margin).to(guidance.device) if self._repaints else None
         rows = []
         for begin in range(0, count, VIEWS_AT_ONCE):
@@ -90,8 +90,14 @@ class PriorEdit(EditedViews):
         mask = mask.clamp(0, 1)
         return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
 
-    def _prompts(self, cameras: CameraBatch) -> list[str]:
-        """The text of each view, as the guidance words it for the first view of a mosaic."""
-        every = self._guidance.view_grid**2
-        azimuths, elevations = (np.repeat(angles, every) for angles in (cameras.azimuth_deg, cameras.elevation_deg))
-        return self._guidance.prompts(GuidanceViews(torch.zeros(len(azimuths), 5, 1, 1), None, azimuths, elevations))
+
+def single_view_prompts(guidance: DiffusionGuidance, cameras: CameraBatch, text: str | None = None) -> list[str]:
+    """The text of each view, as the guidance words it for the first view of a mosaic.
+
+    Args:
+        text: in place of the guidance's prompt.
+    """
+    every = guidance.view_grid**2
+    azimuths, elevations = (np.repeat(angles, every) for angles in (cameras.azimuth_deg, cameras.elevation_deg))
+    views = GuidanceViews(torch.zeros(len(azimuths), 5, 1, 1), None, azimuths, elevations)
+    return guidance.prompts(views, text)

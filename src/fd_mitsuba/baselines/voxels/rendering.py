@@ -55,7 +55,7 @@ def render_values(grid: VoxelGrid, values: Tensor, cameras: CameraBatch, size: i
     return _as_images(torch.cat(rows), len(cameras), size)
 
 
-def view_weights(grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int) -> tuple[Tensor, Tensor]:
+def view_weights(grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int) -> tuple[Tensor, Tensor, Tensor]:
     """The points (P, 3) that an image's rays see, those of weight, with (P,) the pixel of each and (P,) its weight.
 
     What is fitted to images while the density stays fixed needs nothing else: an image is the sum over its points.

@@ -22,7 +22,7 @@ def grid_surface(grid: VoxelGrid) -> TriangleMesh | None:
     edges, faces = crossing_faces(inside)
     if not len(faces):
         return None
-    ends = torch.stack(edge_ends(edges, (grid.resolution,) * 3))
+    ends = torch.stack(edge_ends(edges, (grid.resolution, grid.resolution, grid.resolution)))
     lower_is_inside = inside.view(-1)[ends[0]]
     inner_end = torch.where(lower_is_inside, ends[0], ends[1])
     outer_end = torch.where(lower_is_inside, ends[1], ends[0])
