@@ -49,6 +49,23 @@ def test_one_format(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert not (run_folder / "export" / "mitsuba").exists()
 
 
+def test_levels_of_detail_are_assets_of_their_own(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    options = ["--format", "glb", "mitsuba", "--texture-size", "64", "--json"]
+    assert main(["export", str(run_folder), "--faces", "200,600", *options]) == 0
+    out, lines = capfd.readouterr()
+    written, export = json.loads(out), run_folder / "export"
+    assert written["part_faces"]["part"] <= 600 and written["levels"]["lod_200"]["part"] <= 200
+    assert {"asset.glb", "lod_200/asset.glb"} <= set(written["files"])
+    assert (export / "lod_200" / "asset.glb").stat().st_size < (export / "asset.glb").stat().st_size
+    for faces in (600, 200):
+        assert sum(f"--faces {faces}: part 'part' has" in line for line in lines.splitlines()) == 1
+    # What is exported anew after a change of the parts has the same levels.
+    record = json.loads((export / "mitsuba" / "stack.json").read_text())["export"]
+    assert record["faces"] == 600 and record["levels"] == [200]
+    assert main(["export", str(run_folder), "--faces", "200", "many"]) == 1
+    assert "--faces many" in capfd.readouterr().err
+
+
 def test_what_cannot_be_exported_is_one_line(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     def complaint(folder: Path) -> str:
         assert main(["export", str(folder)]) == 1

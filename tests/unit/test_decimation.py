@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.final_surface.final_part import FinalPart
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.solid import Solid
-from fd_mitsuba.runs.pipeline import _within_budget
+from fd_mitsuba.runs import levels
+from fd_mitsuba.runs.levels import checked_levels, largest_deviation, read_levels
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
@@ -51,7 +53,7 @@ def test_enough_is_left_as_it_is() -> None:
 
 def within_budget(name: str, solid: Solid, faces: int, say: Callable[[str], None]) -> Solid:
     normals = vertex_normals(solid.vertices, solid.faces)
-    return _within_budget(name, FinalPart(solid, normals, np.zeros(len(solid.vertices))), faces, say).solid
+    return levels.within_budget(name, FinalPart(solid, normals, np.zeros(len(solid.vertices))), faces, say).solid
 
 
 def test_what_cannot_be_made_smaller_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,7 +71,9 @@ def test_a_shape_that_needs_more_faces_gets_them_and_that_is_told() -> None:
     said: list[str] = []
     small = within_budget("leaves", leaves(), 100, said.append)
     assert small.manifold and 100 < len(small.faces) < 1000
-    assert said == [f"--faces 100: part 'leaves' keeps {len(small.faces)} faces; with fewer it would fall apart"]
+    (line,) = said
+    assert line.startswith(f"--faces 100: part 'leaves' keeps {len(small.faces)} faces, ")
+    assert line.endswith("; with fewer it would fall apart")
 
 
 def test_a_shape_that_suffers_is_told() -> None:
@@ -77,5 +81,33 @@ def test_a_shape_that_suffers_is_told() -> None:
     ring = trimesh.creation.torus(0.3, 0.05, 120, 40)
     small = within_budget("ring", Solid(ring.vertices, ring.faces), 150, said.append)
     assert len(small.faces) <= 150 and len(said) == 1 and "of its volume left" in said[0]
-    within_budget("wing", ball(level=5), 2000, said.append)
-    assert len(said) == 1
+
+
+def test_every_level_is_told_with_how_far_it_is_off() -> None:
+    said: list[str] = []
+    full = ball(level=5)
+    small = within_budget("wing", full, 2000, said.append)
+    within_budget("wing", full, 10**6, said.append)
+    (line, whole), off = said, largest_deviation(full, small)
+    assert f"part 'wing' has {len(small.faces)} faces, {off:.3g} off the full surface" in line and "fall" not in line
+    assert f"has its full surface, {len(full.faces)} faces" in whole
+    # Equal triangles of a ball: their middles lie r - sqrt(r^2 - edge^2 / 3) deep.
+    edge = np.sqrt(4 * np.pi * 0.25**2 / len(small.faces) * 4 / np.sqrt(3))
+    assert 0.5 * edge**2 / (6 * 0.25) < off < 4 * edge**2 / (6 * 0.25)
+
+
+def test_the_deviation_is_that_of_the_worse_side() -> None:
+    spike = Solid(np.concatenate([ball().vertices[:-1], ball().vertices[-1:] * 2]), ball().faces)
+    reach = np.linalg.norm(ball().vertices[-1])
+    for one, other in ((ball(), spike), (spike, ball())):
+        assert largest_deviation(one, other) == pytest.approx(reach, rel=1e-3)
+
+
+def test_levels_are_read_as_people_write_them() -> None:
+    assert read_levels(["1000,20000", "500"]) == [20000, 1000, 500]
+    assert checked_levels(None) == [] and checked_levels(700) == [700]
+    for wrong, named in ((["-5"], "-5"), (["5e3"], "5e3"), (["20"], "100 or more"), (["500", "500"], "twice")):
+        with pytest.raises(UserError, match=named):
+            read_levels(wrong)
+    with pytest.raises(UserError, match="at most 8"):
+        checked_levels(range(100, 110))

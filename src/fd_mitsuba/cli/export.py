@@ -23,7 +23,12 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
         metavar="FORMAT",
         help="any of glb obj ply mitsuba, or what a plugin registers; default: those four",
     )
-    export.add_argument("--faces", type=int, metavar="N", help="at most so many triangles a part; default: the run's")
+    export.add_argument(
+        "--faces",
+        nargs="+",
+        metavar="N[,N]",
+        help="at most so many triangles a part; of several, one asset a level of detail; default: the run's",
+    )
     export.add_argument("--texture-size", type=int, default=1024, metavar="N", help="texels a side; default: 1024")
     machine_options(export)
     export.add_argument("--json", action="store_true", help="machine-readable")
@@ -106,10 +111,12 @@ def _render(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     start(options)
     from fd_mitsuba.config.toml_reading import read_choice
+    from fd_mitsuba.runs.levels import read_levels
     from fd_mitsuba.runs.pipeline import export_run
 
     formats = [read_choice(item) for item in options.formats]
-    written = export_run(Path(options.run), formats, options.texture_size, remark, options.faces)
+    faces = None if options.faces is None else read_levels(options.faces)
+    written = export_run(Path(options.run), formats, options.texture_size, remark, faces)
     if options.json:
         print(json.dumps(written, indent=2))
         return 0

@@ -39,7 +39,8 @@ def export_assets(
     texture_size: int = 1024,
     say: Callable[[str], None] = lambda line: None,
     cut: CutBase | None = None,
-    face_budget: int | None = None,
+    face_budgets: tuple[int, ...] | None = None,
+    stack_below: Path | None = None,
 ) -> dict[str, Any]:
     """Write the base's files unchanged into `base/`, and the formats asked for; returns what was written.
 
@@ -54,7 +55,8 @@ def export_assets(
         say: takes remarks, a line each.
         cut: the base without the parts, where these were removed from it: it is written, in place of base and parts.
             Where the parts have learned materials, these go to the faces of the cut, as meshes of their own.
-        face_budget: that the parts were decimated to, for the record.
+        face_budgets: that the parts were decimated to, and those of further levels of detail, for the record.
+        stack_below: the export folder whose `mitsuba/stack.json` tells which parts are hidden; None: `folder`.
 
     Parts that `mitsuba/stack.json` in the folder calls hidden or removed are left out of everything.
 
@@ -66,7 +68,7 @@ def export_assets(
     _check(scene, parts, folder, texture_size)
     inputs = scene.inputs
     file = inputs.scene
-    states = {part.name: part for part in read_stack(folder / "mitsuba")[0] if part.state != SHOWN}
+    states = {part.name: part for part in read_stack((stack_below or folder) / "mitsuba")[0] if part.state != SHOWN}
     absent = {part.shape for part in scene.earlier if part.name in states}
     textured = cut is not None and any(part.values is not None for part in parts.values())
     whole = base_shapes(scene, file) if cut is None else cut.opened if textured else cut.shapes
@@ -90,7 +92,9 @@ def export_assets(
         written.append(name)
 
     corrected = {i: shape.corrected for i, shape in enumerate(whole) if shape is not None and shape.corrected}
-    record: dict[str, Any] = {"texture_size": texture_size, "faces": face_budget}
+    record: dict[str, Any] = {"texture_size": texture_size, "faces": None}
+    if face_budgets:
+        record["faces"], record["levels"] = face_budgets[0], list(face_budgets[1:])
     if scene.surroundings:
         record["surroundings"] = scene.surroundings_ids
     content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write, say)
@@ -101,6 +105,7 @@ def export_assets(
         "base_identical": identical,
         "part_faces": {part.name: len(part.mesh.faces) for part in ready},
         "notes": notes,
+        "shading_noise_deg": {part.name: part.noise_deg for part in ready if part.noise_deg is not None},
     }
 
 

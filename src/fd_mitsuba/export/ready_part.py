@@ -50,6 +50,8 @@ class ReadyPart:
     pictures: dict[str, Picture]
     feeds: dict[str, str]
     """Picture -> parameter of the part's BSDF in Mitsuba."""
+    noise_deg: float | None = None
+    """The noise of its shading that the roughness was widened for; None: it is as it was learned."""
 
     def ply(self) -> bytes:
         """The mesh with normals and UVs; Mitsuba wants `flip_tex_coords` for it."""
@@ -79,6 +81,7 @@ def ready_part(
     say(f"baking the textures of {name}, {texture_size} x {texture_size}")
     canonical = replace(mesh, vertices=scene.frame.to_canonical(mesh.vertices))
     textures = bake(canonical, part.values, texture_size)
+    noise = None
     if config.output.roughness_floor:
         noise = surface_noise(canonical.vertices, canonical.faces, bent_normals(canonical, part.values))
         textures = replace(textures, roughness=widened_roughness(textures.roughness, noise))
@@ -101,7 +104,7 @@ def ready_part(
         orm_picture=pictures["orm"],
         normal_picture=pictures.get("normal"),
     )
-    return ReadyPart(name, label, mesh, material, pictures, feeds)
+    return ReadyPart(name, label, mesh, material, pictures, feeds, noise)
 
 
 def _factor(plain: PbrMaterial, fed: PartMaterial) -> tuple[float, float, float]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ from PIL import Image
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.export.bake.shading_noise import widened_roughness
 from fd_mitsuba.export.part_record import part_file
+from fd_mitsuba.fields.texture import TextureValues
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
@@ -199,13 +201,47 @@ def write_appearance(stage: AppearanceStage, folder: Path) -> dict:
     }
 
 
-def lit_turntable(stage: AppearanceStage, count: int, size: int, spp: int) -> np.ndarray:
-    """Frames (count, size, size, 3) uint8 of the finished object, front first."""
+def lit_turntable(
+    stage: AppearanceStage, count: int, size: int, spp: int, noise_deg: Mapping[str, float] | None = None
+) -> np.ndarray:
+    """Frames (count, size, size, 3) uint8 of the finished object, front first.
+
+    Args:
+        noise_deg: part -> the noise that its exported roughness was widened for; see `widened_roughness`.
+    """
+    noises = [(noise_deg or {}).get(name, 0.0) for name in stage.parts]
 
     def shade(gbuffer: GBuffer, seed: int) -> torch.Tensor:
-        return stage.render(gbuffer, stage.texture(gbuffer), seed).merged
+        texture = as_exported(stage.texture(gbuffer), gbuffer.part, noises)
+        return stage.render(gbuffer, texture, seed).merged
 
     return lit_ring(stage.rendering, shade, ring_cameras(count, stage.aim), stage.exposure, size, spp)
+
+
+def as_exported(texture: TextureValues, part: torch.Tensor, noises_deg: Sequence[float]) -> TextureValues:
+    """A material at N points with the roughness that exports hold; no gradients.
+
+    Args:
+        part: (N,) int64, which part each point is of.
+        noises_deg: of each part; 0: its roughness is as it was learned.
+    """
+    roughness = texture.roughness.detach().clone()
+    for number, noise in enumerate(noises_deg):
+        rows = part == number
+        if noise > 0 and bool(rows.any()):
+            roughness[rows] = torch.from_numpy(widened_roughness(roughness[rows].numpy(), noise))
+    return replace(texture, roughness=roughness)
+
+
+def exported_noise(folder: Path) -> dict[str, float]:
+    """Part -> the noise that the exported roughness was widened for, as `part.json` states it."""
+    parts = (read_json_object(folder / "export" / "part.json") or {}).get("parts")
+    found = {}
+    for name, part in (parts if isinstance(parts, dict) else {}).items():
+        noise = part.get("shading_noise_deg") if isinstance(part, dict) else None
+        if isinstance(noise, int | float) and not isinstance(noise, bool) and 0 <= noise <= 180:
+            found[name] = float(noise)
+    return found
 
 
 def render_run(
@@ -221,7 +257,7 @@ def render_run(
     """Render a run's object all around, with other values for the scene's `$name`, such as another light.
 
     Writes `renders/<name>_NN.png` and the sheet `renders/<name>.png` below `folder` and returns their paths. The
-    exposure is the run's own rule applied to the light at hand.
+    exposure is the run's own rule applied to the light at hand. Roughness is what the exports hold.
 
     Raises:
         UserError: no run, no appearance checkpoint, a size or count out of range, and see `load_edit_scene`.
@@ -240,7 +276,8 @@ def render_run(
         raise UserError(f"{folder}: its appearance stage has not begun; run it with --stage appearance")
     stage.set_bounces()
     stage.rendering.limit_bounces(_BRIGHTEST_BOUNCE / stage.exposure)
-    frames = lit_turntable(stage, views, size, spp)
+    noise = exported_noise(folder) if config.output.roughness_floor else {}
+    frames = lit_turntable(stage, views, size, spp, noise)
     paths = [folder / "renders" / f"{name}.png"]
     write_sheet({scene.prompt: frames}, paths[0])
     for number, frame in enumerate(frames):

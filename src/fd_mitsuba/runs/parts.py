@@ -69,7 +69,9 @@ def _change_parts(
     before = record.read_bytes()
     write_atomically(record, stack_bytes(changed, settings))
     try:
-        export_run(run, formats, settings.get("texture_size", 1024), say, settings.get("faces"))
+        first = settings.get("faces")
+        faces = None if first is None else [first, *settings.get("levels", [])]
+        export_run(run, formats, settings.get("texture_size", 1024), say, faces)
     except BaseException:
         write_atomically(record, before)
         raise

@@ -21,7 +21,6 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, chosen_exporters, export_assets
 from fd_mitsuba.export.final_surface.final_part import FinalPart, final_parts
 from fd_mitsuba.export.part_record import part_record
-from fd_mitsuba.export.solid.solid import LEAST_FACES
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.guidance.known_colours import material_left_out
@@ -48,6 +47,7 @@ from fd_mitsuba.runs.geometry_outcome import (
     removed_parts,
     take_geometry,
 )
+from fd_mitsuba.runs.levels import checked_levels, level_folder, within_budget
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
 from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
@@ -59,8 +59,6 @@ from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import OnStep
-
-_VOLUME_CHANGE_SAID = 0.05
 
 
 class SaysWhatItSees(Protocol):
@@ -217,26 +215,34 @@ def export_run(
     formats: Collection[str | Choice],
     texture_size: int,
     say: Callable[[str], None] = print,
-    faces: int | None = None,
+    faces: int | Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Write the assets of a run, finished or interrupted, as of its newest checkpoint; see `export.assets`.
 
     Args:
-        faces: at most so many triangles a part; None: as many as in the run's settings.
+        faces: at most so many triangles a part; None: as many as in the run's settings. Of several, each is a level of
+            detail: the largest is written as ever, the others below `export/lod_<faces>`, each with its own textures.
 
     Raises:
-        UserError: no run or no checkpoint there, and see `export.assets.export_assets`.
+        UserError: no run or no checkpoint there, budgets that cannot be, and see `export.assets.export_assets`.
     """
-    if faces is not None and faces < LEAST_FACES:
-        raise UserError(f"--faces {faces}: give {LEAST_FACES} or more")
+    levels = checked_levels(faces)
     chosen_exporters(formats)  # an unknown one is said before anything is loaded
     scene, config = saved_run(folder, say=say)
     with run_lock(folder, say):
         geometry = load_finished_stage(scene, config, folder)
         appearance = finished_appearance(scene, config, folder)
         field = None if appearance is None else appearance.field
-        finished = final_parts(geometry.grown(), max(faces or 0, config.output.faces), say)
-        return write_assets(geometry, finished, field, folder, formats, texture_size, say, faces)
+        finished = final_parts(geometry.grown(), max([*levels, config.output.faces]), say)
+        first = levels[0] if levels else None
+        settings = (formats, texture_size, say)
+        written = write_assets(geometry, finished, field, folder, *settings, first, tuple(levels[1:]))
+        for level in levels[1:]:
+            below = level_folder(Path(), level)
+            more = write_assets(geometry, finished, field, folder, *settings, level, below=below)
+            written["files"] += [f"{below}/{name}" for name in more["files"]]
+            written.setdefault("levels", {})[str(below)] = more["part_faces"]
+        return written
 
 
 def write_assets(
@@ -248,6 +254,8 @@ def write_assets(
     texture_size: int,
     say: Callable[[str], None],
     faces: int | None = None,
+    levels: tuple[int, ...] = (),
+    below: Path | None = None,
 ) -> dict[str, Any]:
     """Write the assets of the stages' present state below `folder`; returns what `export.assets` says of them.
 
@@ -255,10 +263,13 @@ def write_assets(
         finished: the final surface of every part, see `final_parts`.
         field: the parts' learned material; None: the constants of the scene's part BSDF.
         faces: at most so many triangles a part; None: all that there are.
+        levels: further levels that are written besides, for the record.
+        below: a folder in `folder/export` to write to, of a level of detail.
     """
     scene = geometry.scene
     if faces is not None:
-        finished = {name: _within_budget(name, part, faces, say) for name, part in finished.items()}
+        unit = 1.0 / scene.frame.scale
+        finished = {name: within_budget(name, part, faces, say, unit) for name, part in finished.items()}
     solids = {name: part.solid for name, part in finished.items()}
     normals: dict[str, np.ndarray | None] = {name: part.normals for name, part in finished.items()}
     cut = cut_out(scene, solids) if scene.subtracts else None
@@ -269,17 +280,14 @@ def write_assets(
         for name, solid in solids.items()
     }
     opened = None if cut is None else cut.names(opened=True)
-    write_json(folder / "export" / "part.json", part_record(scene, solids, opened))
     export = folder / "export"
-    return export_assets(scene, geometry.config, parts, export, formats, texture_size, say, cut, faces)
-
-
-def _within_budget(name: str, part: FinalPart, faces: int, say: Callable[[str], None]) -> FinalPart:
-    """The part with at most `faces` faces; `say` hears where the shape needs more, or has suffered."""
-    small, volume = part.decimated(faces), part.solid.volume
-    kept = small.solid.volume / volume if volume > 0 else 1.0
-    if len(small.solid.faces) > faces:
-        say(f"--faces {faces}: part {name!r} keeps {len(small.solid.faces)} faces; with fewer it would fall apart")
-    elif abs(kept - 1) > _VOLUME_CHANGE_SAID:
-        say(f"--faces {faces}: part {name!r} has {kept:.0%} of its volume left; allow more faces for a truer shape")
-    return small
+    target = export if below is None else export / below
+    record = part_record(scene, solids, opened)
+    write_json(target / "part.json", record)
+    budgets = None if faces is None else (faces, *levels)
+    states = None if below is None else export
+    written = export_assets(scene, geometry.config, parts, target, formats, texture_size, say, cut, budgets, states)
+    for name, noise in written["shading_noise_deg"].items():
+        record["parts"].get(name, {})["shading_noise_deg"] = noise
+    write_json(target / "part.json", record)
+    return written

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,14 +84,19 @@ class Run:
 
     @own_threads()
     def export(
-        self, formats: Collection[str | Choice] = ALL_FORMATS, *, faces: int | None = None, texture_size: int = 1024
+        self,
+        formats: Collection[str | Choice] = ALL_FORMATS,
+        *,
+        faces: int | Sequence[int] | None = None,
+        texture_size: int = 1024,
     ) -> list[Path]:
         """Write the result for other programs below `folder/export`; returns the files.
 
         Args:
             formats: any of `glb`, `obj`, `ply`, `mitsuba`, or what is registered besides; `Choice.of("mine", {...})`
                 for one with options.
-            faces: at most so many triangles a part; None: all.
+            faces: at most so many triangles a part; None: all. Of several, the largest is written as ever and the
+                others, as levels of detail, below `folder/export/lod_<faces>`.
             texture_size: texels a side of the parts' textures.
 
         Raises:

@@ -120,6 +120,9 @@ def _export_settings(values: dict[str, Any]) -> dict[str, Any]:
         value = values.get(name, usual)
         if isinstance(value, bool) or not (isinstance(value, int) or value is usual):
             raise ValueError(f"{name} is no number")
+    levels = values.get("levels", [])
+    if not isinstance(levels, list) or any(type(level) is not int for level in levels):
+        raise ValueError("levels are no numbers")
     return dict(values)
 
 

@@ -23,6 +23,7 @@ from fd_mitsuba.export.final_surface.contact import contact_of
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
 from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
+from fd_mitsuba.export.final_surface.rim import rim_normals
 from fd_mitsuba.export.final_surface.shading import smooth_normals
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.part_pieces import fill_pockets, keep_large
@@ -34,6 +35,8 @@ from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FINER = (2, 4)
 """How many times finer than the training's the lattice is: as its edges are to be, within these."""
+_BESIDE_CELLS = 0.5
+"""So far beyond the rim the flank that dives under the base is shaded as if the fillet went on, in cells."""
 _FILM_CELLS = 0.06
 """Where the fillet is lower over the base, in cells of the training, the solid dives under the base."""
 
@@ -101,7 +104,8 @@ def final_part(
         say(f"part {name or 'part'}: its fine surface is no solid; the training's own is written instead")
         plain = part_solid(grown, name)
         return FinalPart(plain, vertex_normals(plain.vertices, plain.faces), np.zeros(len(plain.vertices)))
-    return FinalPart(solid, smooth_normals(vertices, triangles, spacing), distance)
+    normals = smooth_normals(vertices, triangles, spacing, rim_normals(function.rim, vertices, _BESIDE_CELLS * spacing))
+    return FinalPart(solid, normals, distance)
 
 
 def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFunction:

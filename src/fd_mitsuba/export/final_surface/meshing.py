@@ -8,7 +8,7 @@ import numpy as np
 
 from fd_mitsuba.export.final_surface.part_function import PartFunction
 from fd_mitsuba.export.final_surface.projection import project
-from fd_mitsuba.export.final_surface.remesh import remesh
+from fd_mitsuba.export.final_surface.remesh import remesh, tidied
 from fd_mitsuba.export.final_surface.rim import drawn_to_rim, without_crossings
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 
@@ -67,7 +67,10 @@ def evenly_meshed(
     for _ in range(_RIM_ROUNDS):
         vertices = without_crossings(function.rim, vertices, triangles, edge, 1.0)
         vertices, triangles = remeshed(vertices, triangles, edge, 1)
-    near = without_crossings(function.rim, vertices, triangles, edge, _LEAST_AT_RIM_DEG)
+    near = vertices
+    for _ in range(2):
+        near, triangles = tidied(near, triangles, edge)
+        near = without_crossings(function.rim, near, triangles, edge, _LEAST_AT_RIM_DEG)
     exact, _, distance = project(function.with_gradient, near, step, 12, 1e-4 * cell)
     return _without_slivers(near, exact, triangles), triangles, distance
 

@@ -20,11 +20,14 @@ from fd_mitsuba.export.final_surface.mesh_rings import (
     neighbours,
     summed,
 )
+from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (N, 3) -> the nearby points of the surface and the unit outward normals there, (N, 3) each."""
 
 _LONG, _SHORT = 4 / 3, 4 / 5
+_FAR_SHORTER = 0.35
+_TIDYINGS = 10
 _TURNED = 0.35
 """A collapse or flip may turn a face's normal by at most the angle with this cosine."""
 _THIN = 0.05
@@ -54,10 +57,44 @@ def remesh(
             faces, changed = _flip(vertices, faces, rng)
             if not changed:
                 break
-        vertices, normals = project(_slid(vertices, faces))
+        moved, _ = project(_slid(vertices, faces))
+        vertices = unfolded(vertices, moved, faces)
     for _ in range(2):
         faces, _ = _flip(vertices, faces, rng)
     return vertices, faces
+
+
+def tidied(vertices: np.ndarray, faces: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface without edges far shorter than `edge`, nor triangles as flat as their longest side."""
+    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    rng = np.random.default_rng(0)
+    for _ in range(_TIDYINGS):
+        vertices, faces, collapsed = _collapse(vertices, faces, edge, rng, _FAR_SHORTER)
+        faces, flipped = _flip(vertices, faces, rng)
+        if not (collapsed or flipped):
+            break
+    return vertices, faces
+
+
+def unfolded(
+    before: np.ndarray, after: np.ndarray, faces: np.ndarray, least_angle_deg: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """`after` (V, 3), but `before` around faces that turn over on the way, or get angles below `least_angle_deg`.
+
+    Args:
+        least_angle_deg: for all faces, or (F,) for each.
+    """
+    after = after.copy()
+    cross = cross_of_faces(before, faces)
+    while True:
+        bad = np.einsum("ij,ij->i", cross, cross_of_faces(after, faces)) < 0
+        if np.any(least_angle_deg):
+            bad |= smallest_angles(after, faces) < least_angle_deg
+        corners = np.unique(faces[bad])
+        corners = corners[(after[corners] != before[corners]).any(axis=1)]
+        if not len(corners):
+            return after
+        after[corners] = before[corners]
 
 
 def _split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -93,12 +130,12 @@ def _split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.
 
 
 def _collapse(
-    vertices: np.ndarray, faces: np.ndarray, edge: float, rng: np.random.Generator
+    vertices: np.ndarray, faces: np.ndarray, edge: float, rng: np.random.Generator, share: float = _SHORT
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Some of the short edges shrunk to their middles, where that leaves a closed surface of the same kind."""
     count = len(vertices)
     edges = edges_of(faces, count)
-    short = np.flatnonzero(_lengths(vertices, edges.ends) < _SHORT * edge)
+    short = np.flatnonzero(_lengths(vertices, edges.ends) < share * edge)
     if not len(short):
         return vertices, faces, False
     ends, opposite = edges.ends[short], edges.opposite[short]

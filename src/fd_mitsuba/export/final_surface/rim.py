@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
+from fd_mitsuba.export.final_surface.remesh import unfolded
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 
 Rim = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -56,23 +57,23 @@ def without_crossings(
         moved, there = _onto(rim, vertices[chosen], edge)
         tried = vertices.copy()
         tried[chosen[there]] = moved[there]
-        vertices = _where_good(vertices, tried, faces, angles)
+        vertices = unfolded(vertices, tried, faces, angles)
     return vertices
 
 
-def _where_good(before: np.ndarray, after: np.ndarray, faces: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """`after`, but `before` around triangles that it turns over or that get smaller angles than `least` (F,)."""
-    after = after.copy()
-    while True:
-        one, other = (
-            np.cross(v[faces[:, 1]] - v[faces[:, 0]], v[faces[:, 2]] - v[faces[:, 0]]) for v in (before, after)
-        )
-        bad = (smallest_angles(after, faces) < least) | (np.einsum("ij,ij->i", one, other) < 0)
-        corners = np.unique(faces[bad])
-        corners = corners[(after[corners] != before[corners]).any(axis=1)]
-        if not len(corners):
-            return after
-        after[corners] = before[corners]
+def rim_normals(rim: Rim, vertices: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which vertices (K,) lie on the rim or beyond it by up to `below`, and unit normals (K, 3) for them.
+
+    They are those of the fillet, as if it went on: what is seen between the rim and the base is a hair's breadth, and
+    shaded as the flank that it is it would be a dark line around the part.
+    """
+    values, gradients = rim(vertices)
+    side = values[:, 0] / np.maximum(np.linalg.norm(gradients[:, 0], axis=1), 1e-3)
+    chosen = np.flatnonzero((side > -_ON * below) & (side < below) & (np.abs(values[:, 1]) < _BELOW * below))
+    slope = gradients[chosen, 1]
+    length = np.linalg.norm(slope, axis=1)
+    chosen, slope, length = chosen[length > 0.1], slope[length > 0.1], length[length > 0.1]
+    return chosen, -slope / length[:, None]
 
 
 def _side(rim: Rim, points: np.ndarray, edge: float) -> np.ndarray:

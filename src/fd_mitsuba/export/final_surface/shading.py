@@ -21,15 +21,20 @@ _SHARPNESS = 16.0
 """A neighbour counts cos(angle)^16: nine tenths at 6 degrees, next to nothing at an edge of 45."""
 
 
-def smooth_normals(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray:
+def smooth_normals(
+    vertices: np.ndarray, faces: np.ndarray, cell: float, known: tuple[np.ndarray, np.ndarray] | None = None
+) -> np.ndarray:
     """Unit normals (V, 3) float64 of a closed, manifold mesh of even triangles, averaged along the surface.
 
     Neighbours that look elsewhere hardly count, so that an edge stays an edge.
 
     Args:
         cell: of the training, in the vertices' unit.
+        known: vertices (K,) and the unit normals (K, 3) there, in place of the mesh's own.
     """
     normals = vertex_normals(vertices, faces)
+    if known is not None:
+        normals[known[0]] = known[1]
     ends = edges_of(faces, len(vertices)).ends
     edge = float(np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).mean())
     rounds = min(round((_WIDTH_CELLS * cell / (_A_ROUND * max(edge, 1e-12))) ** 2), _MOST_ROUNDS)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fd_mitsuba.export.solid.solid import Solid
+from fd_mitsuba.export.solid.surface_points import surface_points
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 
 _RAYS = 6000
@@ -50,16 +51,10 @@ def measure_walls(solid: Solid, base: MeshDistance | None = None, seed: int = 0)
     if not len(solid.faces):
         return None
     vertices = solid.vertices.astype(np.float64)
-    corners = vertices[solid.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    normals = cross / np.maximum(area, 1e-30)[:, None]
-    rng = np.random.default_rng(seed)
-    ends = np.cumsum(area)
-    face = np.searchsorted(ends, (np.arange(_RAYS) + rng.random(_RAYS)) / _RAYS * ends[-1]).clip(max=len(area) - 1)
-    first, second = np.sqrt(rng.random(_RAYS)), rng.random(_RAYS)
-    weights = np.stack([1 - first, first * (1 - second), first * second], axis=1)
-    points = (weights[..., None] * corners[face]).sum(axis=1)
+    points, face = surface_points(vertices, solid.faces, _RAYS, seed)
+    a, b, c = (vertices[solid.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     if base is not None:
         outside = ~base.inside(points)
         points, face = points[outside], face[outside]
