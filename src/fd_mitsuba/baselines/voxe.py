@@ -44,7 +44,7 @@ class VoxeGlobalSettings(Section):
     """Voxels a side; the original has 160."""
     samples: Samples = 64
     """Points along a ray; the original has 256."""
-    fit_steps: Steps = 600
+    fit_steps: Steps = 800
     """Steps of the fit to images of the base."""
     fit_views: Views = 48
     """How many images these are."""

@@ -16,8 +16,9 @@ from fd_mitsuba.viewing.turntable import Mesh
 
 FOV_DEG, RADIUS = 45.0, 3.0
 _JUDGED_SIZE, _JUDGED_VIEWS = 128, 8
-_SOLID = 2.0
-"""Raw density of the visual hull: a piece of one voxel's length covers nine tenths."""
+_SOLID = 0.0
+"""Raw density of the visual hull: a piece of one voxel's length covers a half. What is denser hides the inside of a
+mug, which no silhouette shows, from the fit."""
 
 
 def fit_cameras(count: int, aim: np.ndarray) -> CameraBatch:
