@@ -40,6 +40,7 @@ def read_dae(path: Path) -> Asset:
     if _NO_NUMBER.search(data):  # pycollada would make it 0
         raise BrokenAsset("has positions, UVs or normals that are NaN or infinite; save the model anew")
     import collada  # takes a quarter of a second
+    import collada.common
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pycollada uses what NumPy deprecates
@@ -50,7 +51,7 @@ def read_dae(path: Path) -> Asset:
         reader = _Reader(document, path)
     if document.scene is None or not reader.meshes:
         raise BrokenAsset("has no faces in its scene, only points, lines or nothing; save a surface")
-    info = document.assetInfo
+    info: Any = document.assetInfo
     scale = float(info.unitmeter or 1.0)
     unit = next((name for metres, name in _UNITS.items() if np.isclose(scale, metres, rtol=1e-6)), None)
     if unit is None:
@@ -141,8 +142,8 @@ class _Reader:
         if colour is None or isinstance(colour, int | float):
             return AssetMaterial(name, base_color=_GREY, double_sided=sides)
         if isinstance(colour, tuple | list):
-            linear = linear_from_srgb(np.clip(np.asarray(colour[:3], dtype=np.float64), 0, 1))
-            return AssetMaterial(name, base_color=tuple(map(float, linear)), double_sided=sides)
+            red, green, blue = linear_from_srgb(np.clip(np.asarray(colour[:3], dtype=np.float64), 0, 1)).tolist()
+            return AssetMaterial(name, base_color=(red, green, blue), double_sided=sides)
         file = str(colour.sampler.surface.image.path or "").removeprefix("file://")
         place = found_beside(self.path.parent, file) if file else None
         if place is None:

@@ -23,7 +23,7 @@ def processor_speed() -> float:
         seconds = []
         for _ in range(_TIMES):
             start = time.perf_counter()
-            matrix @ matrix
+            _ = matrix @ matrix
             seconds.append(time.perf_counter() - start)
     finally:
         torch.set_num_threads(before)

@@ -75,7 +75,8 @@ def contact_of(
     seen = _outside(*surface, base)
     reached = np.abs(base_lattice) < (_BAND_CELLS + 1) * cell
     if part_lattice.max() > 0:
-        reached &= ndimage.distance_transform_edt(part_lattice <= 0, sampling=cell) < (_FAR_CELLS + 2) * cell
+        apart = np.asarray(ndimage.distance_transform_edt(part_lattice <= 0, sampling=cell))
+        reached &= apart < (_FAR_CELLS + 2) * cell
     if seen is None or not reached.any():
         return None
     bounds = [slice(max(s.start - 1, 0), s.stop + 1) for s in ndimage.find_objects(reached.astype(np.int8))[0]]
@@ -90,9 +91,9 @@ def contact_of(
     distance = np.minimum(seen.unsigned(points), _FAR_CELLS * cell)
     raw = np.zeros(marked.shape)
     raw.reshape(-1)[index] = np.where(in_part(points), -distance, distance)
-    nearest = ndimage.distance_transform_edt(~marked, return_distances=False, return_indices=True)
+    nearest = np.asarray(ndimage.distance_transform_edt(~marked, return_distances=False, return_indices=True))
     smooth = ndimage.gaussian_filter(raw[tuple(nearest)], _SMOOTH_CELLS * _FINER, mode="nearest")
-    gradient = np.stack(np.gradient(smooth, step)[::-1])
+    gradient = np.stack([np.gradient(smooth, step, axis=axis) for axis in (2, 1, 0)])
     return Contact(ndimage.spline_filter(smooth, 3, mode="nearest"), gradient, origin, step)
 
 
