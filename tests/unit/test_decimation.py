@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import fast_simplification
 import numpy as np
@@ -14,7 +15,7 @@ from fd_mitsuba.export.final_surface.final_part import FinalPart
 from fd_mitsuba.export.solid.decimation import decimated
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.runs import levels
-from fd_mitsuba.runs.levels import checked_levels, largest_deviation, read_levels
+from fd_mitsuba.runs.levels import checked_levels, largest_deviation, read_levels, remove_other_levels
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
@@ -111,3 +112,11 @@ def test_levels_are_read_as_people_write_them() -> None:
             read_levels(wrong)
     with pytest.raises(UserError, match="at most 8"):
         checked_levels(range(100, 110))
+
+
+def test_levels_of_an_earlier_export_go(tmp_path: Path) -> None:
+    for name in ("lod_200", "lod_600", "lod_notes", "glb"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "asset.glb").write_bytes(b"")
+    remove_other_levels(tmp_path, [600])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["glb", "lod_600", "lod_notes"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+import shutil
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,15 @@ def checked_levels(faces: int | Sequence[int] | None) -> list[int]:
 def level_folder(export: Path, faces: int) -> Path:
     """Where a level after the first goes."""
     return export / f"lod_{faces}"
+
+
+def remove_other_levels(export: Path, levels: Collection[int]) -> None:
+    """Take away the folders of levels that an earlier export wrote and this one has not, so that nothing old lies
+    beside what is new."""
+    for folder in export.glob("lod_*"):
+        number = folder.name.removeprefix("lod_")
+        if folder.is_dir() and not folder.is_symlink() and number.isdecimal() and int(number) not in levels:
+            shutil.rmtree(folder)
 
 
 def within_budget(name: str, part: FinalPart, faces: int, say: Callable[[str], None], unit: float = 1.0) -> FinalPart:

@@ -47,7 +47,7 @@ from fd_mitsuba.runs.geometry_outcome import (
     removed_parts,
     take_geometry,
 )
-from fd_mitsuba.runs.levels import checked_levels, level_folder, within_budget
+from fd_mitsuba.runs.levels import checked_levels, level_folder, remove_other_levels, within_budget
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
 from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
@@ -242,6 +242,7 @@ def export_run(
             more = write_assets(geometry, finished, field, folder, *settings, level, below=below)
             written["files"] += [f"{below}/{name}" for name in more["files"]]
             written.setdefault("levels", {})[str(below)] = more["part_faces"]
+        remove_other_levels(folder / "export", levels[1:])
         return written
 
 
