@@ -186,7 +186,7 @@ def test_a_mesh_in_a_format_that_mitsuba_does_not_read(
 ) -> None:
     trimesh.creation.icosphere().export(tmp_path / f"ball.{suffix}")
     message = message_of(make_scene(base=BASE.replace('"ply"', f'"{plugin}"').replace("animal.ply", f"ball.{suffix}")))
-    for word in ("body", f"ball.{suffix}", "PLY, OBJ", "convert", "'ball.ply'"):
+    for word in ("body", f"ball.{suffix}", "PLY, OBJ", f"fd_mitsuba import ball.{suffix}"):
         assert word in message, message
 
 

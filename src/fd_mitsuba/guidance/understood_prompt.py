@@ -27,16 +27,17 @@ def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = ""
             'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
             "geometry.lambda_sds=0"
         )
+    unknown = ", ".join(map(repr, reading.unknown_parts))
+    which = f"knows no part {unknown}" if unknown else "knows no such part"
     if (fine := vocabulary_of(BUILTIN_FINE)) is not None and vocabulary != fine:
         if known := read_prompt(prompt, fine, base_prompt).parts:
             raise UserError(
-                f"prompt {prompt!r}: the built-in prior knows no such part, but the fine one knows {', '.join(known)}; "
+                f"prompt {prompt!r}: the built-in prior {which}, but the fine one knows {', '.join(known)}; "
                 f"set guidance.model={BUILTIN_FINE}"
             )
     hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
-    which = f"knows no part {', '.join(map(repr, reading.unknown_parts))}" if reading.unknown_parts else ""
     raise UserError(
-        f"prompt {prompt!r}: the built-in prior {which or 'knows no such part'}; nearest: {hint}; reword it "
+        f"prompt {prompt!r}: the built-in prior {which}; nearest: {hint}; reword it "
         "(`fd_mitsuba prior` lists the words), or set guidance.model to a Stable Diffusion folder or hub id"
     )
 
