@@ -92,7 +92,8 @@ def _parts(options: argparse.Namespace) -> int:
 
 def _render(options: argparse.Namespace) -> int:
     start(options)
-    from fd_mitsuba.runs.appearance_outcome import render_by_sensor, render_run
+    from fd_mitsuba.runs.appearance_outcome import render_run
+    from fd_mitsuba.runs.sensor_image import render_by_sensor
 
     run, name, changed = Path(options.run), options.output or "render", definitions(options)
     if options.sensor is not None:

@@ -130,7 +130,8 @@ class Run:
         Raises:
             UserError: the appearance stage has not begun, a size or count out of range.
         """
-        from fd_mitsuba.runs.appearance_outcome import render_by_sensor, render_run
+        from fd_mitsuba.runs.appearance_outcome import render_run
+        from fd_mitsuba.runs.sensor_image import render_by_sensor
 
         if sensor is not None:
             return render_by_sensor(self.folder, sensor, name, spp, max_depth, dict(values or {}))

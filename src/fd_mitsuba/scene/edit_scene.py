@@ -14,8 +14,6 @@ from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import is_coarse, size_problem
 from fd_mitsuba.scene.base_choice import choose_base
-from fd_mitsuba.scene.base_mesh import element_triangles, placement
-from fd_mitsuba.scene.doubled_faces import without_reversed_copies
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.finite_numbers import refuse_broken_parameters, refuse_broken_properties
@@ -25,12 +23,12 @@ from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import part_names
 from fd_mitsuba.scene.part_stack import RECORD_NAME, StackedPart, earlier_parts, free_name
-from fd_mitsuba.scene.region_mode import check_modes, region_mode
+from fd_mitsuba.scene.region_element import read_region
+from fd_mitsuba.scene.region_mode import check_modes
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
-from fd_mitsuba.scene.region_prompt import check_prompts, part_prompts, region_prompt
-from fd_mitsuba.scene.region_shapes import ELLIPSOID
+from fd_mitsuba.scene.region_prompt import check_prompts, part_prompts
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
-from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 
 @dataclass(frozen=True)
@@ -197,7 +195,7 @@ def load_edit_scene(
     elements = inputs.region_elements()
 
     def provisional(frame: Normalisation) -> list[FocalRegion]:
-        return [_region(owner, element, index, "", frame) for index, (owner, element) in enumerate(elements)]
+        return [read_region(owner, element, index, "", frame) for index, (owner, element) in enumerate(elements)]
 
     choice = choose_base(inputs, provisional)
     base = choice.meshes
@@ -214,7 +212,7 @@ def load_edit_scene(
         raise UserError(f"{inputs.sources[-1].path}: no focal region; {remedy}")
     names = part_names([element for _, element in elements], earlier)
     found = tuple(
-        _region(owner, element, index, names[index], frame) for index, (owner, element) in enumerate(elements)
+        read_region(owner, element, index, names[index], frame) for index, (owner, element) in enumerate(elements)
     )
     soup = _soup(base)
     roomy = frame_with_headroom(frame, soup.vertices[np.unique(soup.faces)], found)
@@ -303,28 +301,3 @@ def _frame(file: SceneFile, base: tuple[TriangleMesh, ...]) -> Normalisation:
             f"{file.path}: base {names}: its {count} faces enclose no volume; give a solid object, closed or nearly so"
         )
     return frame
-
-
-def _region(file: SceneFile, element: SceneElement, index: int, part: str, frame: Normalisation) -> FocalRegion:
-    to_world = placement(element)
-    name = element.id or f"region_{index + 1}"
-    mesh = None
-    filename = element.properties.get("filename")
-    vertices, faces = element_triangles(file, element)
-    if filename:
-        if not topology(vertices, faces).closed:
-            raise element.error(f"{filename}: the region's mesh is not closed; fill its holes, or use an ellipsoid")
-        twice = len(faces) - len(without_reversed_copies(vertices, faces))
-        if twice:
-            problem = f"{twice} faces of the region's mesh are there twice, once each way round"
-            raise element.error(f"{filename}: {problem}; remove the copies")
-    if filename or element.properties.get("shape", ELLIPSOID) != ELLIPSOID:
-        sources = (file.resolve(filename),) if filename else ()
-        mesh = TriangleMesh(name, frame.to_canonical(vertices), faces, sources)
-    region = FocalRegion(name, frame.matrix() @ to_world, part, mesh, region_mode(element), region_prompt(element))
-    if not region.volume > 0:
-        raise element.error("the region has no volume; enlarge it")
-    if mesh is not None and not region.has_inside():
-        problem = "the region's mesh has no inside, because pieces of it cancel each other"
-        raise element.error(f"{filename}: {problem}; make the faces of all pieces point outwards")
-    return region
