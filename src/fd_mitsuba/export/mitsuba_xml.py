@@ -12,7 +12,6 @@ import numpy as np
 
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.io.safe_text import safe_file_name
-from fd_mitsuba.scene.base_choice import shapes_without_lamps
 from fd_mitsuba.scene.edit_inputs import EditInputs
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import ANALYTIC
@@ -69,18 +68,18 @@ def mitsuba_scene(
     cut = cut or {}
     own |= {name for name in cut.values() if name is not None}
     file = inputs.scene
-    listed = iter(shapes_without_lamps(file))
+    listed = iter(file.top_level("shape"))
     numbers = {id(element): number for number, element in enumerate(scene.base_elements)}
     around = {id(element): name for element, name in zip(scene.surroundings, scene.surroundings_ids, strict=True)}
     names = _Names(file, own)
     root = ET.Element("scene", {"version": "3.0.0"})
     for element in _elements(file):
+        shape = next(listed) if element.tag == "shape" else None
         if element.get("type") in (FOCAL_REGION, DUAL_PATH):
             continue
         if _is_part_bsdf(element):
             continue
-        if element.tag == "shape" and element.find("emitter") is None:
-            shape = next(listed)
+        if shape is not None and (id(shape) in numbers or id(shape) in around):
             number = numbers.get(id(shape))
             if element.get("id") in without:
                 continue
