@@ -25,7 +25,8 @@ SOURCE = Path(__file__).resolve().parents[2] / "src"
 WORKS, REFUSED, USAGE = "works", "one line, exit 1", "usage, exit 2"
 TRACEBACK, SIGNAL, HANG, OTHER = "traceback", "signal", "hang", "other"
 _PLACE = re.compile(
-    r"\.\w+:\d+|<\w+|(^| )--?\w|line \d+|\w+\.\w+ ?=|base \w+|\.toml: (\w+(\.\w+)*: |unknown key|not valid)"
+    r"\.\w+:\d+|<\w+|(^| )--?\w|line \d+|\w+\.\w+ ?=|base \w+|placement \d+: |"
+    r"\.toml: (\w+(\.\w+)*: |unknown key|not valid)"
 )
 _WHOLE_FILE = re.compile(
     r": (the file is empty|(is a|is not a|is no|no such|not a|not an|cannot be read|not found|has|is larger than)\b)"

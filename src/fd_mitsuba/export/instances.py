@@ -29,7 +29,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.instance_glb import instance_glb
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.glb import glb_content
-from fd_mitsuba.io.json_object import read_json_object
+from fd_mitsuba.io.json_object import json_fault, read_json_object, syntax_fault
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
 
 _KEYS = {"part", "to_world", "position", "direction", "twist_deg", "scale", "base"}
@@ -58,6 +58,9 @@ def write_instances(run: Path, transforms: Path, name: str) -> list[Path]:
     folder = run / "export"
     scene = folder / "mitsuba" / "scene.xml"
     record = read_json_object(folder / "part.json")
+    if record is None and (folder / "part.json").is_file():
+        fault = json_fault(folder / "part.json")
+        raise UserError(f"{folder / 'part.json'}: is damaged ({fault}); run fd_mitsuba export {run} anew")
     if record is None or not scene.is_file():
         raise UserError(f"{scene}: missing, or without part.json; run fd_mitsuba export {run} first")
     _check_record(folder / "part.json", record)
@@ -124,7 +127,7 @@ def read_placements(path: Path, record: dict[str, Any]) -> list[Placement]:
     except RecursionError:
         raise UserError(f"{path}: not a list of placements (nested too deep); write [{{...}}, ...]") from None
     except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); mend that line") from None
+        raise UserError(f"{path}: not valid JSON ({syntax_fault(error)}); mend that line") from None
     if not isinstance(entries, list) or not entries or len(entries) > MOST_PLACEMENTS:
         raise UserError(f"{path}: not a list of 1 to {MOST_PLACEMENTS} placements; write [{{...}}, ...]")
     return [_placement(f"{path}: placement {number}", entry, record) for number, entry in enumerate(entries, 1)]

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.io.json_object import read_json_object
+from fd_mitsuba.io.json_object import json_fault, read_json_object
 from fd_mitsuba.runs.run_folder import identity
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
 
@@ -126,5 +126,5 @@ def _read(path: Path) -> dict:
         raise UserError(f"{path.parent}: not a run (no {path.name}); give the -o folder of a run")
     data = read_json_object(path)
     if data is None:
-        raise UserError(f"{path}: is damaged; start the run anew in another folder")
+        raise UserError(f"{path}: is damaged ({json_fault(path)}); start the run anew in another folder")
     return data

@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from fd_mitsuba.errors import UserError
+from fd_mitsuba.errors import UserError, first_line
+from fd_mitsuba.io.json_object import json_fault
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 RECORD_NAME = "stack.json"
@@ -103,9 +104,10 @@ def read_stack(folder: Path) -> tuple[tuple[StackedPart, ...], dict[str, Any]]:
         entries = [{key: value for key, value in entry.items() if key in names} for entry in record["parts"]]
         parts = tuple(_entry(entry) for entry in entries)
         return parts, _export_settings(record.get("export", {}))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        fault = json_fault(path) or f"parts: {first_line(error)}"
         raise UserError(
-            f"{path}: is damaged; export the run anew, or delete it (prompts and rounds are lost)"
+            f"{path}: is damaged ({fault}); export the run anew, or delete it (prompts and rounds are lost)"
         ) from None
 
 

@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.json_object import json_fault
 
 if TYPE_CHECKING:
     from fd_mitsuba.scene.edit_scene import EditScene
@@ -104,7 +105,10 @@ def copied_files(scene: Path) -> dict[str, Path]:
     names = names if isinstance(names, dict) else {}
     places = [PurePosixPath(str(place)) for place in names.values()]
     if not places or any(place.is_absolute() or ".." in place.parts for place in places):
-        raise UserError(f"{path}: is damaged; put the scene's files where the scene names them, and delete this file")
+        fault = json_fault(path) or "names: a place outside this folder, or none"
+        raise UserError(
+            f"{path}: is damaged ({fault}); put the scene's files where the scene names them, and delete this file"
+        )
     return {name: folder / place for name, place in zip(names, places, strict=True)}
 
 

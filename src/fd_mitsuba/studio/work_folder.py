@@ -16,7 +16,7 @@ from typing import Any
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.io.json_object import read_json_object, write_json
+from fd_mitsuba.io.json_object import json_fault, read_json_object, write_json
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.scene_copy import SceneCopy
 
@@ -64,7 +64,8 @@ class WorkFolder:
             raise UserError(f"{self.path}: is no work folder of the studio and not empty; choose another -o folder")
         data = read_json_object(self.record)
         if data is None or data.get("version") != VERSION:
-            raise UserError(f"{self.record}: is damaged or of another version; choose another -o folder")
+            fault = json_fault(self.record) or "version: another one"
+            raise UserError(f"{self.record}: is damaged or of another version ({fault}); choose another -o folder")
         return data
 
     def adopted(self) -> list[Path]:

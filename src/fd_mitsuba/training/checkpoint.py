@@ -125,9 +125,10 @@ def load_trained(run: Path, stage: Stage, config_hash: str) -> bool:
     folder = checkpoint_folder(run, stage.name)
     if not list_checkpoints(folder):
         return False
-    done, _ = load_newest(folder, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
+    done, remarks = load_newest(folder, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
     if not done:
-        raise UserError(f"{folder}: every checkpoint is damaged; run the {stage.name} stage again")
+        newest = remarks[0].removeprefix(f"{folder}/") if remarks else ""
+        raise UserError(f"{folder}: every checkpoint is damaged ({newest}); run the {stage.name} stage again")
     return True
 
 
