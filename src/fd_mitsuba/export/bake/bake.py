@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 
 from fd_mitsuba.export.bake.atlas_raster import AtlasRaster, rasterise, weights_at
 from fd_mitsuba.export.bake.tangents import face_directions, vertex_tangents
@@ -130,6 +129,8 @@ def fill_holes(pictures: list[np.ndarray], known: np.ndarray) -> None:
     """Give every texel that is not `known` (H, W) the value of the nearest one that is, in place."""
     if known.all() or not known.any():
         return
+    from scipy.ndimage import distance_transform_edt  # imported late: whoever only names formats needs none
+
     nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rows, columns = nearest
     holes = ~known

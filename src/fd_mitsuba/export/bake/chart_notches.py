@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 _NEAR = 3.2
 """Filtering reads texels up to sqrt(2) away, and each is to be nearer to its own side: twice that, and half a texel's
@@ -68,6 +67,8 @@ def charts_of(faces: np.ndarray, count: int) -> np.ndarray:
 def crowded(points: np.ndarray, faces: np.ndarray, flat: np.ndarray, density: float) -> np.ndarray:
     """Faces at one side of each place that is too narrow, the worst first; arguments as those of `open_notches`."""
     owner, places, where = _edge_samples(points, faces, flat, density)
+    from scipy.spatial import KDTree  # imported late: whoever only names formats needs none
+
     pairs = KDTree(places).query_pairs(_NEAR, output_type="ndarray")
     chart = charts_of(faces, len(flat))[faces[:, 0]][owner]
     pairs = pairs[(chart[pairs[:, 0]] == chart[pairs[:, 1]]) & (owner[pairs[:, 0]] != owner[pairs[:, 1]])]

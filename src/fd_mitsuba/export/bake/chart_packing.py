@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import fft
-from scipy.ndimage import distance_transform_edt
 
 _CELLS = 256
 _STARTS_AT, _STEP, _TRIES = 0.74, 0.975, 14
@@ -59,6 +57,8 @@ def packed_charts(
 
 
 def _shapes(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray, count: int, gutter: float) -> list[_Shape]:
+    from scipy.ndimage import distance_transform_edt  # imported late: whoever only names formats needs none
+
     points, owner = _covering(flat, faces, of_face)
     reach = int(np.ceil(gutter + 0.5))
     shapes = []
@@ -94,6 +94,8 @@ def _covering(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> tuple
 
 def _laid(shapes: list[_Shape], order: np.ndarray, cells: int) -> list[tuple[int, np.ndarray]] | None:
     """Per chart its quarter turns and the cell of its mask's corner; None where they do not fit."""
+    from scipy import fft
+
     taken = np.zeros((cells, cells), dtype=np.float32)
     places: list[tuple[int, np.ndarray]] = [(0, np.zeros(2))] * len(shapes)
     for number in order:

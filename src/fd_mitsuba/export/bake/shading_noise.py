@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from fd_mitsuba.scene.vertex_normals import angles_between, vertex_normals
 
@@ -48,6 +47,8 @@ def surface_noise(
     normals = vertex_normals(vertices, faces) if normals is None else np.asarray(normals, dtype=np.float64)
     points, shading = _spread(vertices, faces, normals, seed)
     radius = smoothed_over * float(np.ptp(vertices, axis=0).max())
+    from scipy.spatial import KDTree  # imported late: whoever only names formats needs none
+
     pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     pairs = pairs[np.einsum("ij,ij->i", shading[pairs[:, 0]], shading[pairs[:, 1]]) > 0]
     return float(np.degrees(angles_between(shading, _fitted(points, shading, pairs, radius))).mean())
