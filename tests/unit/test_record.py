@@ -122,6 +122,16 @@ def test_video_opens_and_shows_the_frames(tmp_path: Path, size: int) -> None:
     assert seen[1].mean() < 10 and 150 < seen[4, ..., 1].mean() < 230
 
 
+def test_the_same_frames_give_the_same_video(tmp_path: Path) -> None:
+    """x264 writes down how it worked. Its look-ahead by macroblock trees read what was in the memory before it."""
+    frames = np.random.default_rng(0).integers(0, 255, (12, 48, 80, 3), np.uint8)
+    for name in ("a.mp4", "b.mp4"):
+        write_video(frames, tmp_path / name)
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data == (tmp_path / "b.mp4").read_bytes()
+    assert b" threads=1 " in data and b" mbtree=0 " in data
+
+
 def test_numbers_are_json(tmp_path: Path) -> None:
     with Recorder(tmp_path, "geometry", 1, quiet=True) as recorder:
         recorder.row(1, "coarse", {"loss": 0.1234567891})

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
-import imageio.v3 as imageio
+import av
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
@@ -15,6 +16,8 @@ from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.viewing.sheets import normal_pictures
 
+_SAME_BYTES = {"threads": "1", "x264-params": "mbtree=0"}
+"""x264's threads end in no fixed order, and its tree of macroblocks reads memory that nobody has written."""
 Mesh = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -31,14 +34,18 @@ def render_ring(mesh: Mesh, count: int, size: int, aim: np.ndarray, elevation_de
 def write_video(frames: np.ndarray, path: Path, frames_per_second: int = 16) -> None:
     """Write an H.264 video of frames (count, height, width, 3) uint8, whole or not at all.
 
-    The codec wants even sides: an odd one is repeated at its edge.
+    The codec wants even sides: an odd one is repeated at its edge. The same frames give the same bytes.
     """
     odd = [(0, side % 2) for side in frames.shape[1:3]]
     frames = np.pad(frames, [(0, 0), *odd, (0, 0)], mode="edge")
-    data = imageio.imwrite(
-        "<bytes>", frames, extension=path.suffix, plugin="pyav", codec="libx264", fps=frames_per_second
-    )
-    write_atomically(path, data)
+    data = io.BytesIO()
+    with av.open(data, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=frames_per_second, options=_SAME_BYTES)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for frame in (*(av.VideoFrame.from_ndarray(frame, format="rgb24") for frame in frames), None):  # None: the rest
+            container.mux(stream.encode(frame))
+    write_atomically(path, data.getvalue())
 
 
 def write_sheet(rows: dict[str, np.ndarray], path: Path) -> None:
