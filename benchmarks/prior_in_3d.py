@@ -27,23 +27,15 @@ import torch  # noqa: E402
 from prior_pairs import CASES, Case, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
+from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, PartJudge, changed_pixels, load_judge  # noqa: E402
+from fd_mitsuba.evaluation.verdict import judged_views  # noqa: E402
 from fd_mitsuba.io.json_object import write_json  # noqa: E402
-from fd_mitsuba.prior.judging.part_judge import (  # noqa: E402
-    CHECKOUT_CLASSIFIER,
-    LEAST_PIXELS,
-    PartJudge,
-    changed_pixels,
-    load_judge,
-)
-from fd_mitsuba.prior.pictures.corpus import CAMERA_RADIUS  # noqa: E402
-from fd_mitsuba.render.geometry_pass import GeometryPass  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.edit_scene import load_edit_scene  # noqa: E402
-from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 from fd_mitsuba.viewing.turntable import render_ring, write_sheet  # noqa: E402
 
-VIEWS, VIEW_SIZE, SHEET_SIZE = 8, 32, 112
+VIEWS, SHEET_SIZE = 8, 112
 ELEVATION_DEG, HALF_WIDTH = 15.0, 1.25
 """In the middle of what the classifier was trained on: elevations of -10 to 45 degrees, half widths of 1.05 to 1.5."""
 LEAST_FOUND, MOST_AT_START = 0.80, 0.20
@@ -98,23 +90,12 @@ def judge_run(case: Case, folder: Path, judge: PartJudge) -> tuple[dict, np.ndar
         grown = stage.surface()
     start, base = stage.start_surface(), stage.base_surface
     meshes = [(surface.vertices, surface.faces) for surface in (base, start, grown)]
-    before, *others = (ring_views(mesh, stage.aim) for mesh in meshes)
+    before, *others = (judged_views(*mesh, stage.aim, ELEVATION_DEG, HALF_WIDTH) for mesh in meshes)
     figures = {
         name: judged(judge, case.part, before, views) for name, views in zip(("start", "end"), others, strict=True)
     }
     pictures = [render_ring(mesh, VIEWS, SHEET_SIZE, stage.aim) for mesh in meshes[1:]]
     return figures, np.concatenate(pictures)
-
-
-def ring_views(mesh: Mesh, aim: np.ndarray) -> np.ndarray:
-    """Eight views (8, 4, 32, 32) of a canonical mesh as `pictures.corpus` draws them: n coverage, 2 coverage - 1."""
-    fov = 2 * np.degrees(np.arctan(HALF_WIDTH / CAMERA_RADIUS))
-    azimuths = np.arange(VIEWS) * (360.0 / VIEWS)
-    cameras = CameraBatch.around(azimuths, ELEVATION_DEG, CAMERA_RADIUS, fov, np.tile(aim, (VIEWS, 1)))
-    vertices, faces = mesh
-    weights = torch.zeros(len(vertices))
-    pictures = GeometryPass(VIEW_SIZE, 16, 0).render_primal(vertices.float(), faces, weights, cameras, seed=0).numpy()
-    return np.concatenate([pictures[:, :3], 2 * pictures[:, 3:4] - 1], axis=1)
 
 
 def judged(judge: PartJudge, part: str, before: np.ndarray, after: np.ndarray) -> dict:
@@ -176,7 +157,7 @@ def main() -> int:
     parser.add_argument("--config", type=Path, default=ROOT / "configs" / "quick.toml")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--cores", default="", metavar="LIST", help="pin the runs to these cores, as taskset has them")
-    parser.add_argument("--classifier", type=Path, default=CHECKOUT_CLASSIFIER, metavar="FOLDER")
+    parser.add_argument("--classifier", type=Path, default=ROOT / "benchmarks" / "part_classifier", metavar="FOLDER")
     parser.add_argument("--judge-only", action="store_true", help="start no runs")
     options = parser.parse_args()
     try:

@@ -9,6 +9,9 @@ from pathlib import Path
 from fd_mitsuba.cli.options import remark
 from fd_mitsuba.errors import UserError
 
+ROUNDS_OF_BODIES = 3
+"""Unseen random bodies of each name on which a judge of parts is measured."""
+
 
 def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     """Put `prior` and its actions beside the other commands."""
@@ -20,8 +23,8 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
     train.add_argument(
         "--kind",
         default="geometry",
-        help="geometry (normals), geometry_fine (at 64 pixels a view), appearance (colours) or evaluator (the "
-        "metrics' CLIP)",
+        help="geometry (normals), geometry_fine (at 64 pixels a view), appearance (colours), evaluator (the metrics' "
+        "CLIP), part_judge (gives a run its verdict) or part_judge_coarse (that of the benchmarks)",
     )
     train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, help="length of the schedule; default: what the kind takes to be good")
@@ -61,7 +64,9 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     )
     evaluate.add_argument("folder", nargs="?", help="packed prior; default: the built-in one")
     evaluate.add_argument(
-        "--kind", default="geometry", help="geometry (default), geometry_fine, appearance or evaluator"
+        "--kind",
+        default="geometry",
+        help="geometry (default), geometry_fine, appearance, evaluator, part_judge or part_judge_coarse",
     )
     evaluate.add_argument("-o", "--output", metavar="FILE", help="PNG; the metrics go into a .json beside it")
     evaluate.add_argument(
@@ -69,7 +74,7 @@ def _add_evaluate(actions: argparse._SubParsersAction) -> None:
     )
     evaluate.add_argument("--parts", default="all", metavar="A,B", help="default: all")
     evaluate.add_argument(
-        "--classifier", metavar="FOLDER", help="judge of parts, whose model.py is run; default: that of a checkout"
+        "--classifier", metavar="FOLDER", help="a part_judge; default: benchmarks/part_classifier of a checkout"
     )
     evaluate.add_argument("--overviews", action="store_true", help="no views centred on the part: half the time")
     evaluate.add_argument("--steps", type=int, default=16, help="of DDIM; default: 16")
@@ -110,6 +115,8 @@ def _prior_train(options: argparse.Namespace) -> int:
     share_cores(options.threads)
     if options.kind == "evaluator":
         return _evaluator_train(options)
+    if options.kind.startswith("part_judge"):
+        return _part_judge_train(options)
     from fd_mitsuba.guidance.device import require_device
     from fd_mitsuba.prior.training.dataset import StoredPairs
     from fd_mitsuba.prior.training.kinds import kind_named
@@ -153,6 +160,19 @@ def _evaluator_train(options: argparse.Namespace) -> int:
     return 0
 
 
+def _part_judge_train(options: argparse.Namespace) -> int:
+    from fd_mitsuba.backend.threads import network_threads
+    from fd_mitsuba.prior.training.part_judge_train import judge_kind, train_part_judge
+
+    if options.init:
+        raise UserError("--init: a judge of parts starts from random weights; leave it out")
+    output = Path(options.output)
+    with network_threads():
+        train_part_judge(output, judge_kind(options.kind), options.hours * 3600, options.steps)
+    print(f"{output}: weights.safetensors, classes.json; checkpoint.pt, log.jsonl and views may go")
+    return 0
+
+
 def _prior_pack(options: argparse.Namespace) -> int:
     from fd_mitsuba.prior.training.pack import pack
 
@@ -181,6 +201,8 @@ def _prior_build_data(options: argparse.Namespace) -> int:
 def _prior_evaluate(options: argparse.Namespace) -> int:
     if options.kind == "evaluator":
         return _evaluator_evaluate(options)
+    if options.kind.startswith("part_judge"):
+        return _part_judge_evaluate(options)
     from fd_mitsuba.backend.threads import share_cores
     from fd_mitsuba.prior.training.kinds import kind_named
 
@@ -210,18 +232,34 @@ def _evaluator_evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
+def _part_judge_evaluate(options: argparse.Namespace) -> int:
+    from fd_mitsuba.backend.threads import share_cores
+
+    share_cores(options.threads)
+    from fd_mitsuba.evaluation.part_judge import load_judge
+    from fd_mitsuba.io.json_object import write_json
+    from fd_mitsuba.prior.training.part_judge_train import judge_kind, measure
+
+    kind = judge_kind(options.kind)
+    figures = measure(load_judge(Path(options.folder)) if options.folder else load_judge(), kind, ROUNDS_OF_BODIES)
+    if options.output:
+        write_json(Path(options.output), figures)
+    print(json.dumps(figures, indent=2))
+    return 0
+
+
 def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) -> None:
     from fd_mitsuba.evaluation.clip import ClipJudge
+    from fd_mitsuba.evaluation.part_judge import WEIGHTS_NAME, load_judge
     from fd_mitsuba.prior.judging.body_namer import BodyNamer
     from fd_mitsuba.prior.judging.evaluate_parts import evaluate_parts
-    from fd_mitsuba.prior.judging.part_judge import CHECKOUT_CLASSIFIER, load_judge
     from fd_mitsuba.prior.training.kinds import kind_named
 
     kind = kind_named(options.kind)
-    if options.classifier or (CHECKOUT_CLASSIFIER / "weights.safetensors").is_file():
-        judge = load_judge(Path(options.classifier) if options.classifier else CHECKOUT_CLASSIFIER)
-    else:
-        judge = None
+    # One that was trained apart from the judge that is shipped: neither must be measured by itself.
+    classifier = Path(options.classifier or Path(__file__).resolve().parents[3] / "benchmarks" / "part_classifier")
+    judge = load_judge(classifier) if options.classifier or (classifier / WEIGHTS_NAME).is_file() else None
+    if judge is None:
         remark("no classifier of parts here, so recall is left out; give one by --classifier")
     bodies, parts = (
         list(known) if text == "all" else [name.strip() for name in text.split(",") if name.strip()]

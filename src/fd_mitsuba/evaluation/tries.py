@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.conventions import STAGES
-from fd_mitsuba.errors import RunStopped, UserError
+from fd_mitsuba.errors import RunStopped, UserError, first_line
 from fd_mitsuba.evaluation.report.run_page import reported
 from fd_mitsuba.evaluation.verdict import SURE, can_be_judged, judge_run
 from fd_mitsuba.io.atomic import write_atomically
@@ -50,8 +50,8 @@ def run_tries(
     stages: Collection[str] = STAGES,
     opening: Sequence[str] = (),
 ) -> dict:
-    """Grow up to `tries` shapes, with the seeds from `config.seed` on, until the built-in evaluator is sure that one
-    looks like the prompt; then run the other stages for the best. Returns what `metrics.json` of that run holds.
+    """Grow up to `tries` shapes, with the seeds from `config.seed` on, until the built-in judge of parts is sure that
+    one looks like the prompt; then run the other stages for the best. Returns what that run's `metrics.json` holds.
 
     Args:
         folder: the run folder; the others are those of `pipeline.run`.
@@ -98,7 +98,7 @@ def _refuse(
     if not can_be_judged(scene, config):
         raise UserError(
             f"--tries: nobody can say which try is best: the prompt {scene.prompt!r} does not ask for one part that "
-            "the built-in evaluator knows, or nothing guides the shape; run without --tries"
+            "the built-in judge knows, or nothing guides the shape; run without --tries"
         )
     if not (folder / TRIES_RECORD).is_file():
         check_folder(scene, config, folder, False)
@@ -163,8 +163,11 @@ def _read(folder: Path) -> list[Try]:
     record = read_json_object(folder / TRIES_RECORD) or {}
     try:
         return [Try(**one) for one in record.get("tries", ())]
-    except TypeError:
-        raise UserError(f"{folder / TRIES_RECORD}: is damaged; remove it and {folder / TRIES_FOLDER}") from None
+    except TypeError as error:
+        fault = f"tries: {first_line(error)}"
+        raise UserError(
+            f"{folder / TRIES_RECORD}: is damaged ({fault}); remove it and {folder / TRIES_FOLDER}"
+        ) from None
 
 
 def _write(folder: Path, done: list[Try], taken: int | None) -> None:

@@ -1,30 +1,40 @@
 """Whether a grown part looks like what the prompt asks for, in the eyes of a judge that knows a list of parts.
 
-    P(part) = softmax over the parts and "nothing" of
-        SHARPNESS * scale * mean over views of ( cos(edited, t) - cos(base, t) / 2 - cos(start, t) / 2 )
+    P(part) ~ mean over views of p(part | base, edited object)
 
-with the sentences t "a cat with <part>" and "a cat", and the judge's own scale. What the base or the bare regions are
-taken for by themselves (a cat's tail, a region like a wing) so counts little. Only views that show the part count. And
-the prompt's part must be clearly likelier than it was at the start: a region like a wing that stayed is no wing.
+over rings of views of the whole object and close-ups of the part, restricted to the parts that the prompt could ask for
+and "nothing", and scaled to a sum of 1. Only views that show the part count. What the base has by itself (a cat's tail)
+says nothing, since the judge sees each view before and after; a bare region or a lump is "nothing" to it. And the
+prompt's part must be clearly likelier than it was at the start: a region like a wing that stayed is no wing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.for_model import BUILTIN_FINE
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.evaluation.clip import ClipJudge, cosines
-from fd_mitsuba.evaluation.judged_views import RADIUS, shape_pictures
+from fd_mitsuba.evaluation.part_judge import (
+    CAMERA_RADIUS,
+    JUDGE_FOLDER,
+    LEAST_PIXELS,
+    VIEW_SIZE,
+    PartJudge,
+    changed_pixels,
+    load_judge,
+)
+from fd_mitsuba.evaluation.part_judge import NOTHING as JUDGED_NOTHING
+from fd_mitsuba.extraction.surface import UnionSurface
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
+from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -32,13 +42,14 @@ from fd_mitsuba.training.geometry_stage import GeometryStage
 NOTHING = "nothing"
 LIKE, SURE = 0.5, 0.8
 """Least share of the prompt's part for "looks like", and for a verdict that ends a series of tries."""
-SHARPNESS = 1.5
-"""With it 91 % of unseen true parts have a share of at least `LIKE`, and 7 % of bare starts (docs/evaluation.md)."""
-_VIEWS_A_RING, _ELEVATIONS_DEG, _SIZE, _SPP = 12, (15.0, 45.0), 96, 9
-_LEAST_SEEN = 20.0
-"""Pixels of a view in which a part counts as seen."""
+JUDGE_NAME = "built-in judge of parts"
+_VIEWS_A_RING, _ELEVATIONS_DEG, _SPP = 8, (15.0, 40.0), 16
+_HALF_WIDTH = 1.25
+"""Of a view of the whole object, canonical units; in the middle of what the judge was trained on."""
+_CLOSE, _LEAST_HALF_WIDTH = 1.5, 0.3
+"""Half width of a close-up, in radii of the part, and at least so wide; both as in the judge's training."""
 _LEAST_GAIN = 1.0
-"""By how much the part's log odds must exceed those of the start; 97 % of the true parts' do."""
+"""By how much the part's log odds must exceed those of the start."""
 _SHOWN = 3
 
 
@@ -50,7 +61,6 @@ class Verdict:
     gain: log odds of the prompt's part, less those that the start has.
     views: how many views show the part.
     judge: who says so.
-    version: of its weights.
     """
 
     part: str
@@ -58,7 +68,6 @@ class Verdict:
     gain: float
     views: int
     judge: str
-    version: str
 
     @property
     def share(self) -> float:
@@ -91,6 +100,8 @@ class Verdict:
             seen = "no view shows it"
         elif self.share >= LIKE:
             seen = "it is still much as it started"
+        elif nearest == NOTHING:
+            seen = f"like no part that the judge knows ({_share(self.shares[nearest])})"
         return (
             f"does NOT look like {self.part} ({_share(self.share)}); {seen}; enlarge or move the region, or try "
             "another seed (--tries 3)"
@@ -106,86 +117,118 @@ class Verdict:
             "shares": {name: round(share, 4) for name, share in self.shares.items() if share >= 0.005},
             "gain": round(self.gain, 3),
             "views": self.views,
-            "judge": f"{self.judge} {self.version}",
+            "judge": self.judge,
         }
 
 
-def judge_part(stage: GeometryStage, judge: ClipJudge, vocabulary: Vocabulary) -> Verdict | None:
+def judge_part(
+    stage: GeometryStage, judge: PartJudge, vocabulary: Vocabulary, name: str = JUDGE_NAME
+) -> Verdict | None:
     """The verdict on a finished geometry stage; None where the prompt does not ask for one part that the judge knows.
 
     Args:
-        vocabulary: the parts and bodies that the judge can be asked for; those whose words it never saw are left out.
+        vocabulary: the words in which the prompt is read, and the parts that it could have asked for.
     """
-    reading = read_prompt(stage.scene.prompt, vocabulary, stage.scene.base_prompt)
-    parts = {name: phrases[0] for name, phrases in vocabulary.parts.items() if not judge.unknown_words(phrases[0])}
-    if len(reading.parts) != 1 or reading.parts[0] not in parts:
+    wanted = _wanted(stage.scene, vocabulary)
+    parts = [part for part in vocabulary.parts if part in judge.classes]
+    if wanted not in parts:
         return None
-    turn = np.arange(_VIEWS_A_RING) * (360.0 / _VIEWS_A_RING)
-    kind = "normals" if judge.geometry_pictures == "normals" else "shaded"
-    rings = [
-        CameraBatch.around(turn, elevation, RADIUS, 45.0, np.tile(stage.aim, (len(turn), 1)))
-        for elevation in _ELEVATIONS_DEG
-    ]
-    drawn = [shape_pictures(stage, cameras, _SIZE, _SPP, kind) for cameras in rings]
-    edited, base, start = (
-        judge.images(torch.cat([getattr(pictures, name) for pictures in drawn])) for name in ("edited", "base", "start")
-    )
-    seen = torch.cat([pictures.part_pixels for pictures in drawn])
-    body = vocabulary.bodies[reading.bodies[0]][0] if reading.bodies else _body_of(judge, base, vocabulary)
-    texts = judge.texts([*(f"a {body} with {phrase}" for phrase in parts.values()), f"a {body}"])
-    shares = part_shares(edited, base, start, texts, seen, judge.scale)
+    edited, start = (list(_pairs(stage, surface)) for surface in (stage.surface(), stage.start_surface()))
+    shares, views = part_shares(judge, parts, edited)
+    begun, _ = part_shares(judge, parts, start)
     ranked = sorted(zip((*parts, NOTHING), shares, strict=True), key=lambda item: -item[1])
-    own = list(parts).index(reading.parts[0])
-    now, before = (part_shares(shown, base, base, texts, seen, judge.scale)[own] for shown in (edited, start))
-    gain = _log_odds(now) - _log_odds(before)
-    count = int((seen >= _LEAST_SEEN).sum())
-    return Verdict(reading.parts[0], dict(ranked), gain, count, judge.name, judge.version)
+    own = parts.index(wanted)
+    return Verdict(wanted, dict(ranked), _log_odds(shares[own]) - _log_odds(begun[own]), views, name)
 
 
 def can_be_judged(scene: EditScene, config: RunConfig) -> bool:
-    """Whether the built-in evaluator can say if a run looks like its prompt: the prompt guides the shape, and asks for
-    one part, in the evaluator's words, to be added.
+    """Whether the built-in judge can say if a run looks like its prompt: the prompt guides the shape, and asks for one
+    part, in the judge's words, to be added.
     """
-    vocabulary = vocabulary_of("builtin")
+    vocabulary = _words(config)
     if config.geometry.lambda_sds == 0 or scene.subtracts or vocabulary is None:
         return False
-    return len(read_prompt(scene.prompt, vocabulary, scene.base_prompt).parts) == 1
+    return _wanted(scene, vocabulary) is not None
 
 
 def judge_run(geometry: GeometryStage, say: Callable[[str], None]) -> Verdict | None:
-    """What the built-in evaluator says of a finished shape; None where it cannot be asked."""
-    vocabulary = vocabulary_of("builtin")
+    """What the built-in judge says of a finished shape; None where it cannot be asked."""
+    vocabulary = _words(geometry.config)
     if vocabulary is None or not can_be_judged(geometry.scene, geometry.config):
         return None
     try:
-        return judge_part(geometry, ClipJudge.load(), vocabulary)
+        return judge_part(geometry, load_judge(JUDGE_FOLDER), vocabulary)
     except UserError as error:
         say(f"no verdict on the part: {error}")
         return None
 
 
 def part_shares(
-    edited: Tensor, base: Tensor, start: Tensor, texts: Tensor, seen: Tensor, scale: float
-) -> Sequence[float]:
-    """The formula above; the last text is the one without a part, and all of the share where no view shows any.
+    judge: PartJudge, parts: Sequence[str], pictures: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[list[float], int]:
+    """Shares of `parts` and of nothing, which has all where no view shows any; and how many views show something.
 
     Args:
-        edited, base, start: features (N, D) of the same views.
-        texts: (M, D).
-        seen: (N,) pixels that the part covers. Views with less than a third of the most do not count.
-        scale: what the judge's cosines were multiplied with in its training.
+        parts: classes of the judge that may come out.
+        pictures: sets of views (N, 4, 32, 32) before and after. Views with less than a third of their set's most
+            changed pixels do not count.
     """
-    chosen = (seen >= _LEAST_SEEN) & (seen >= seen.max() / 3)
-    if not chosen.any():
-        return [*[0.0] * (len(texts) - 1), 1.0]
-    after, *before = (cosines(features[chosen], texts).double().mean(0) for features in (edited, base, start))
-    return torch.softmax(SHARPNESS * scale * (after - sum(before) / 2), 0).tolist()
+    said = []
+    for before, after in pictures:
+        changed = changed_pixels(before, after)
+        chosen = (changed >= LEAST_PIXELS) & (changed >= changed.max() / 3)
+        said.append(judge(before[chosen], after[chosen]))
+    every = np.concatenate(said)
+    if not len(every):
+        return [*[0.0] * len(parts), 1.0], 0
+    columns = [judge.classes.index(part) for part in (*parts, JUDGED_NOTHING)]
+    shares = every[:, columns].astype(np.float64).mean(0)
+    return (shares / max(shares.sum(), 1e-9)).tolist(), len(every)
 
 
-def _body_of(judge: ClipJudge, base: Tensor, vocabulary: Vocabulary) -> str:
-    """The body whose name fits the base's pictures best."""
-    nouns = [phrases[0] for phrases in vocabulary.bodies.values()]
-    return nouns[int(cosines(base, judge.texts([f"a {noun}" for noun in nouns])).mean(0).argmax())]
+def _words(config: RunConfig) -> Vocabulary | None:
+    """The guidance model's own, or for a model that knows any word, those of the judge."""
+    return vocabulary_of(config.guidance.model) or vocabulary_of(BUILTIN_FINE)
+
+
+def _wanted(scene: EditScene, vocabulary: Vocabulary) -> str | None:
+    parts = read_prompt(scene.prompt, vocabulary, scene.base_prompt).parts
+    return parts[0] if len(parts) == 1 else None
+
+
+@torch.no_grad()
+def _pairs(stage: GeometryStage, surface: UnionSurface) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Views of the base and of a surface with a part: rings around the whole, then close-ups around the part."""
+    part = surface.vertices[surface.part_weight > 0.5].double().numpy()
+    frames = [(elevation, stage.aim, _HALF_WIDTH) for elevation in _ELEVATIONS_DEG]
+    if len(part):
+        low, high = part.min(0), part.max(0)
+        half = np.clip(_CLOSE * np.linalg.norm(high - low) / 2, _LEAST_HALF_WIDTH, _HALF_WIDTH)
+        frames.append((25.0, (low + high) / 2, float(half)))
+    for elevation, target, half in frames:
+        base, whole = (
+            judged_views(which.vertices, which.faces, target, elevation, half)
+            for which in (stage.base_surface, surface)
+        )
+        yield base, whole
+
+
+def judged_views(
+    vertices: torch.Tensor, faces: torch.Tensor, target: np.ndarray, elevation_deg: float, half_width: float
+) -> np.ndarray:
+    """A ring of views (8, 4, 32, 32) of a mesh as `PartJudge` takes them, the first from the front.
+
+    Args:
+        vertices, faces: (V, 3) canonical, (F, 3).
+        target: (3,) what the cameras look at, canonical.
+        half_width: of the view at the target, canonical units.
+    """
+    fov = 2 * np.degrees(np.arctan(half_width / CAMERA_RADIUS))
+    turn = np.arange(_VIEWS_A_RING) * (360.0 / _VIEWS_A_RING)
+    cameras = CameraBatch.around(turn, elevation_deg, CAMERA_RADIUS, fov, np.tile(target, (len(turn), 1)))
+    rendering, weight = GeometryPass(VIEW_SIZE, _SPP, 0), torch.zeros(len(vertices))
+    pictures = rendering.render_primal(vertices.float(), faces, weight, cameras, seed=0).numpy()
+    return np.concatenate([pictures[:, :3], 2 * pictures[:, 3:4] - 1], axis=1)
 
 
 def _log_odds(share: float) -> float:

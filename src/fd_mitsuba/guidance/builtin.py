@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 
 from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
@@ -41,6 +42,14 @@ def builtin_folder(folder: Path = BUILTIN_FOLDER) -> Path:
         )
     verify_hashes(folder)
     return folder
+
+
+def write_hashes(folder: Path, files: Iterable[Path]) -> None:
+    """Write `folder/SHA256SUMS` of files in that folder, as `verify_hashes` reads it."""
+    lines = [
+        f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}\n" for p in sorted(files)
+    ]
+    (folder / SUMS_NAME).write_text("".join(lines), encoding="utf-8")
 
 
 def verify_hashes(folder: Path) -> None:

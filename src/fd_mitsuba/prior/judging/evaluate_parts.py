@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, NOTHING, PartJudge, changed_pixels
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.prior.data.captions import PART_WORDS
@@ -26,14 +27,7 @@ from fd_mitsuba.prior.judging.evaluate import (
     keeps_body,
     picture,
 )
-from fd_mitsuba.prior.judging.part_judge import (
-    LEAST_PIXELS,
-    NOTHING,
-    PartJudge,
-    changed_pixels,
-    seen_by_judge,
-    views_of,
-)
+from fd_mitsuba.prior.judging.single_views import seen_by_judge, views_of
 from fd_mitsuba.prior.pictures.corpus import Pair
 from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fd_mitsuba.backend.startup import start
+from fd_mitsuba.evaluation.part_judge import CAMERA_RADIUS
 from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.captions import caption, random_style, view_words
 from fd_mitsuba.prior.data.parts import PARTS, resized
@@ -20,7 +21,6 @@ from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 VIEW_SIZE = 32
 SUPERSAMPLING = 2
-CAMERA_RADIUS = 3.0
 LEAST_PIXELS = 12
 """Of a mosaic that a part must change to be seen at all."""
 STYLED_SHARE = 0.3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from tokenizers import Regex, normalizers
 from torch import Tensor
 from transformers import CLIPConfig, CLIPModel, CLIPTextConfig, CLIPVisionConfig, PreTrainedTokenizerFast
 
-from fd_mitsuba.guidance.builtin import SUMS_NAME
+from fd_mitsuba.guidance.builtin import SUMS_NAME, write_hashes
 from fd_mitsuba.prior.pictures.clip_corpus import PATCH, SIZE
 from fd_mitsuba.prior.training.model import TEXT_LENGTH, build_tokenizer, token_numbers
 
@@ -102,6 +101,4 @@ def save_evaluator(model: CLIPModel, folder: Path, about: dict | None = None) ->
         ("fd_mitsuba.json", {**CONVENTIONS, "about": about or {}}),
     ):
         (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name != SUMS_NAME)
-    lines = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in files]
-    (folder / SUMS_NAME).write_text("".join(lines), encoding="utf-8")
+    write_hashes(folder, (path for path in folder.iterdir() if path.is_file() and path.name != SUMS_NAME))

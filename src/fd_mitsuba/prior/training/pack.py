@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import diffusers
 import torch
 
-from fd_mitsuba.guidance.builtin import SUMS_NAME
+from fd_mitsuba.guidance.builtin import SUMS_NAME, write_hashes
 from fd_mitsuba.prior.training import clip_train
 from fd_mitsuba.prior.training.kinds import GEOMETRY, kind_named
 from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer
@@ -55,6 +54,4 @@ def pack(checkpoint: Path, folder: Path) -> None:
     }
     (folder / "model_index.json").write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
     kind.save_conventions(folder)
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != SUMS_NAME)
-    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}\n" for p in files]
-    (folder / SUMS_NAME).write_text("".join(lines), encoding="utf-8")
+    write_hashes(folder, (p for p in folder.rglob("*") if p.is_file() and p.name != SUMS_NAME))

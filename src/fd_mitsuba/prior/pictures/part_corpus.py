@@ -1,4 +1,8 @@
-"""What the judge of parts is trained on: views of distorted bodies before and after a distorted part was added."""
+"""What the judge of parts is trained on: views of distorted bodies before and after a distorted part was added.
+
+What is no part, but may come out of a run, is shown too: the ellipsoids that it started from, and lumps in a part's
+place.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
+from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, changed_pixels
 from fd_mitsuba.prior.data.catalogue import COARSE, Catalogue
 from fd_mitsuba.prior.data.primitives import Solid, ellipsoid, join, rotation
 from fd_mitsuba.prior.pictures.corpus import MosaicCamera, RayCaster, closeup_camera, shade
@@ -14,19 +19,19 @@ from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 SEEN_SEED = 2**33
 """Training draws from here on, far from the prior's seeds (below 2**31), its evaluation's and the CLIP evaluator's."""
+SEEDS_APART = 2**36
+"""Between the bodies of one training and those of the next `--seed`."""
 UNSEEN_SEED = 2**34
 CLOSEUP_SHARE = 0.25
 BLOB_SHARE = 0.35
 """Parts that are also shown as the ellipsoids that a run would start from, which are no part."""
-LEAST_PIXELS = 5.0
-"""Views in which less than so many pixels change show no part."""
 
 
 @dataclass(frozen=True)
 class Views:
     """Int8 views (N, 4, 32, 32) in units of 1/127 before and after, and what was added: an index into the classes.
 
-    `closeup` (N,) tells views centred on the part, `blob` (N,) those with ellipsoids in its place.
+    `closeup` (N,) tells views centred on the part, `blob` (N,) those with ellipsoids or lumps in its place.
     """
 
     before: np.ndarray
@@ -40,8 +45,14 @@ class Views:
         return len(self.label)
 
 
-def make_views(body: str, seed: int, catalogue: Catalogue = COARSE) -> Views:
-    """Four views of every part on one random body and of the body alone, deterministic in (body, seed)."""
+def make_views(body: str, seed: int, catalogue: Catalogue = COARSE, lump_share: float = 0.0) -> Views:
+    """Four views of every part on one random body and of the body alone, deterministic in all arguments.
+
+    Args:
+        body: a name of the catalogue.
+        seed: from `SEEN_SEED` on for training, from `UNSEEN_SEED` on for measuring.
+        lump_share: of the parts, that are also shown as `lumps_of` them.
+    """
     number, parts = list(catalogue.body_weights).index(body), list(catalogue.part_weights)
     rng = np.random.default_rng([seed, number])
     made = catalogue.make_body(body, rng)
@@ -76,14 +87,11 @@ def make_views(body: str, seed: int, catalogue: Catalogue = COARSE) -> Views:
         see(solid, label, closeup, False)
         if rng.random() < BLOB_SHARE:
             see(warp(blobs_of(original, rng)), len(parts), closeup, True)
+        if lump_share and rng.random() < lump_share:
+            see(warp(lumps_of(original, rng)), len(parts), closeup, True)
     alone = _views(shade(*hits, rays[2]))
     rows += [(view, view, len(parts), number, False, False) for view in alone]
     return Views(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def changed_pixels(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """How many pixels of views (..., 4, H, W) differ, soft ones counted in part."""
-    return np.clip(np.abs(after - before).max(-3) / 0.3, 0, 1).sum((-2, -1))
 
 
 def blobs_of(part: Solid, rng: np.random.Generator) -> Solid:
@@ -98,6 +106,23 @@ def blobs_of(part: Solid, rng: np.random.Generator) -> Solid:
         half = np.maximum(half * rng.uniform(0.7, 1.15, 3), 0.05)
         solids.append(ellipsoid(centre, half, rotation(*rng.uniform(-12, 12, 3))))
     return join(solids)
+
+
+def lumps_of(part: Solid, rng: np.random.Generator) -> Solid:
+    """Two to six bent ellipsoids at random vertices of a part, as large as a third of it: what a run that failed grows.
+
+    They fill the part's place and have none of its form.
+    """
+    size = np.ptp(part.vertices, axis=0)
+    lumps = []
+    for _ in range(rng.integers(2, 7)):
+        centre = part.vertices[rng.integers(len(part.vertices))] * 0.8 + part.vertices.mean(0) * 0.2
+        half = np.maximum(size.max() * rng.uniform(0.08, 0.3) * rng.uniform(0.5, 1.3, 3), 0.03)
+        lump = ellipsoid(centre, half, rotation(*rng.uniform(-90, 90, 3)))
+        waves = rng.normal(size=(3, 3)) * (2.0 / half.max())
+        bumps = np.sin(lump.vertices @ waves + rng.uniform(0, 6, 3)) @ rng.normal(size=(3, 3))
+        lumps.append(Solid(lump.vertices + bumps * (half.min() * rng.uniform(0, 0.25)), lump.faces))
+    return join(lumps)
 
 
 class _Warp:
