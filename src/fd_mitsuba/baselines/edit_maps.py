@@ -34,9 +34,9 @@ _OUTLIERS = 0.99
 def refuse_without_attention(task: EditTask) -> DiffusionGuidance:
     """The task's guidance; UserError where it has no cross-attention to look at."""
     guidance = task.guidance.inner
-    if not isinstance(guidance, DiffusionGuidance) or guidance.inpaints:
+    if not isinstance(guidance, DiffusionGuidance) or guidance.inpaints or guidance.takes_cameras:
         raise UserError(
-            f"guidance.model = {task.config.guidance.source}: voxe needs a diffusion model that sees the whole image; "
+            f"guidance.model = {task.config.guidance.source}: voxe needs a diffusion model that sees one whole image; "
             "take voxe_global instead"
         )
     return guidance
