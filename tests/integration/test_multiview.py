@@ -12,10 +12,11 @@ import diffusers
 import numpy as np
 import pytest
 import torch
+from accelerate import init_empty_weights
 from diffusers.models.attention_processor import Attention
 from safetensors.torch import save_file
 from test_whole_run import SETTINGS
-from tiny_multiview import MultiViewUNet, edit, made_unet, save_multiview
+from tiny_multiview import CONFIG, MultiViewUNet, edit, made_unet, save_multiview
 from tiny_pipelines import save_pipeline
 from tiny_runs import write_place
 from torch import Tensor
@@ -29,6 +30,7 @@ from fd_mitsuba.guidance import diffusion, loading, step_draws
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews
 from fd_mitsuba.guidance.multiview import JointAttention, camera_conditions
+from fd_mitsuba.guidance.multiview_layout import unet_config
 from fd_mitsuba.training.record import read_metrics
 
 AZIMUTHS, ELEVATIONS = [10.0, 100.0, 190.0, 280.0], [20.0] * 4
@@ -153,6 +155,18 @@ def test_one_view_a_group_and_no_cameras_is_the_plain_unet(root: Path, tmp_path:
     with torch.no_grad():
         got = load(folder).predict_noise(z_t, times, {"text": texts}, None, cameras=cameras)["text"]
         assert_close(got, plain(z_t, times, texts).sample, 1e-5)
+
+
+def test_the_published_config_has_the_weights_of_its_base_and_an_mlp() -> None:
+    """Stable Diffusion 2.1's UNet has 865,910,724; the MLP leads from 16 numbers over 1280 to 1280."""
+    published = CONFIG | dict(image_size=32, model_channels=320, num_res_blocks=2, channel_mult=[1, 2, 4, 4])
+    published |= dict(attention_resolutions=[4, 2, 1], num_head_channels=64, context_dim=1024)
+    config = unet_config(Path("config.json"), {"_class_name": "MultiViewUNetModel"} | published)
+    with init_empty_weights():
+        unet = diffusers.UNet2DConditionModel.from_config(config)
+    assert sum(weight.numel() for weight in unet.parameters()) == 865_910_724 + 17 * 1280 + 1281 * 1280
+    heads = {block.to_q.in_features: block.heads for name, block in unet.named_modules() if name.endswith("attn1")}
+    assert heads == {320: 5, 640: 10, 1280: 20}, "of 64 channels each"
 
 
 # Guidance.
