@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,15 +20,20 @@ from fd_mitsuba.baselines.compare import compare, compare_jobs
 from fd_mitsuba.baselines.fantasia3d import Fantasia3dSettings, WholeObjectStage, fit_error
 from fd_mitsuba.baselines.figures import SEEN_AT
 from fd_mitsuba.baselines.interface import EditedMesh, EditTask, mesh_images
+from fd_mitsuba.baselines.jobs import CompareJob
 from fd_mitsuba.baselines.measuring import CompareProtocol
 from fd_mitsuba.baselines.methods import BASELINES
+from fd_mitsuba.baselines.processes import run_processes
 from fd_mitsuba.baselines.table import compare_header, compare_rows
 from fd_mitsuba.baselines.voxe import VoxeGlobalSettings, fitted_grid
 from fd_mitsuba.baselines.voxels.edit_stage import loss_correlation
-from fd_mitsuba.cli.main import main
+from fd_mitsuba.cli.compare import process_of
+from fd_mitsuba.cli.main import command_parser, main
+from fd_mitsuba.cli.scene_options import chosen_settings
 from fd_mitsuba.config import RunConfig, Section
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import NoSettings
+from fd_mitsuba.config.toml_reading import read_choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.guidance.sources import GUIDANCES
@@ -217,6 +224,9 @@ def test_a_comparison_from_jobs_to_figures(
     cells = {row[0]: dict(zip(compare_header(), row, strict=True)) for row in rows}
     assert cells["fantasia3d"]["paper CLIP_sim"] == "0.284" and cells["broken"]["results"] == "0"
     assert "| focaldreamer | 0.329 | 0.0519 |" in (tmp_path / "compare.md").read_text()
+    page = (tmp_path / "compare.html").read_text()
+    assert '<td>fantasia3d</td><td class="number">0.284</td>' in page and "RuntimeError: a fault" in page
+    assert page.count('src="data:image/') == 1 and "http" not in page.replace("http-equiv", "")
 
     # What is finished is read again, and other settings are not mixed with it.
     monkeypatch.setattr(jobs_module, "measure", lambda *_: pytest.fail("measured again"))
@@ -226,6 +236,33 @@ def test_a_comparison_from_jobs_to_figures(
     (again,) = compare_jobs([place / "scene.xml"], [Choice.of("fantasia3d")], [3], other, tmp_path)
     (refused,) = compare([again], MeanColour(), protocol, tmp_path, said.append).outcomes
     assert refused.state == "failed" and "other settings" in refused.message
+
+
+def test_jobs_as_processes_of_a_batch(place: Path, tmp_path: Path) -> None:
+    """A process is told the same job in words; one that fails costs its own result, and is not tried again."""
+    words = ["compare", str(place / "scene.xml"), "--methods", "fantasia3d {lambda_volume = 2.0}", "--seeds", "4"]
+    words += ["-c", str(place / "tiny.toml"), "--set", "geometry.steps=5", "-o", str(tmp_path)]
+
+    def jobs_of(words: list[str]) -> tuple[list[CompareJob], argparse.Namespace, list[Choice]]:
+        options = command_parser().parse_args(words)
+        methods = [read_choice(text) for text in options.methods]
+        scenes, config = [Path(scene) for scene in options.scenes], chosen_settings(options).config
+        return compare_jobs(scenes, methods, options.seeds, config, Path(options.output)), options, methods
+
+    (job,), options, methods = jobs_of([*words, "--views", "12", "--size", "32", "--workers", "2"])
+    process = process_of(options, methods)(job)
+    (same,), given, _ = jobs_of(process.words(1))
+    assert (same.task_key(), same.folder) == (job.task_key(), job.folder)
+    assert given.one and (given.views, given.size, given.threads) == (12, 32, 1)
+
+    protocol, said = CompareProtocol(12, 32), []
+    broken = (sys.executable, "-c", "print('fd_mitsuba: error: it broke'); exit(1)")
+    outcomes = run_processes(
+        [job], process_of(options, methods), MeanColour(), protocol, tmp_path, 2, 1, said.append, broken
+    )
+    assert [(outcome.state, outcome.message) for outcome in outcomes] == [("failed", "it broke")]
+    found = compare([job], MeanColour(), protocol, tmp_path, said.append, tried={job.name: "it broke"})
+    assert not found.whole and said[-1] == f"[1/1] {job.name}: failed: it broke" and not job.folder.exists()
 
 
 def test_bad_input_is_one_line(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
