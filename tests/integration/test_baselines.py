@@ -25,8 +25,9 @@ from fd_mitsuba.baselines.measuring import CompareProtocol
 from fd_mitsuba.baselines.methods import BASELINES
 from fd_mitsuba.baselines.processes import run_processes
 from fd_mitsuba.baselines.table import compare_header, compare_rows
-from fd_mitsuba.baselines.voxe import VoxeGlobalSettings, fitted_grid
+from fd_mitsuba.baselines.voxe import VoxeGlobalSettings
 from fd_mitsuba.baselines.voxels.edit_stage import loss_correlation
+from fd_mitsuba.baselines.voxels.fitting import base_shown, fitted_grid
 from fd_mitsuba.cli.compare import process_of
 from fd_mitsuba.cli.main import command_parser, main
 from fd_mitsuba.cli.scene_options import chosen_settings
@@ -148,7 +149,7 @@ def test_voxe_global_fits_the_base_and_grows_where_the_guidance_wants_it(
     )
     after, before = (float(images(VIEWS, 24).mask.mean()) for images in (edited.images, edited.base_images))
     assert after > 1.05 * before > 0
-    base, _ = fitted_grid(VoxeGlobalSettings(**options), scene, 0)
+    base, _ = fitted_grid(VoxeGlobalSettings(**options), base_shown(scene), 0)
     away = [loss_correlation(found.grid.density, base.density).item() for found in (held, edited)]
     assert 1.5 * away[0] < away[1], "the correlation loss holds the grid to the base"
     assert edited.mesh is not None and edited.mesh.volume() > 0
@@ -296,20 +297,46 @@ def test_three_steps_of_every_method_with_every_layout(
         "geometry.views=4",
     ]
     config = RunConfig.load(place / "tiny.toml", overrides)
-    for name in ("fantasia3d", "voxe_global", "voxe"):
+    seen = {"attention_views": 2}
+    methods = {"fantasia3d": {}, "dreameditor": seen, "voxe_global": VOXELS, "voxe": VOXELS | seen}
+    for name, options in methods.items():
         given = EditTask(scene, config, tmp_path / name, lambda line: None)
-        options = VOXELS if name == "voxe_global" else VOXELS | {"attention_views": 2} if name == "voxe" else {}
         edited = BASELINES.make(Choice.of(name, options), "here", given)
         # Two views whose attention is recorded, or two draws of noise for each.
-        extra = 0 if name != "voxe" else 4 if kind == "builtin" else 2
+        extra = 0 if options is not seen and name != "voxe" else 4 if kind == "builtin" else 2
         assert given.guidance.calls == 3 and edited.guidance_calls == 3 + extra
         images = edited.images(VIEWS, 24)
         assert images.values.isfinite().all() and images.mask.max() > 0.9
     assert 0 < edited.fit["edited_share"] < 1
     # What is not labelled is the base's again: less is changed than without the refinement.
-    base, _ = fitted_grid(VoxeGlobalSettings(**VOXELS), scene, 0)
+    base, _ = fitted_grid(VoxeGlobalSettings(**VOXELS), base_shown(scene), 0)
     same = (edited.grid.density == base.density).float().mean()
     assert same > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["builtin", "ip2p"])
+def test_three_updates_of_instruct_nerf2nerf(kind: str, scene: EditScene, place: Path, tmp_path: Path) -> None:
+    """The guidance model edits normals; a pipeline edits the base under its light, and the grid has colours."""
+    model = "" if kind == "builtin" else str(save_pipeline(kind, tmp_path / kind))
+    config = RunConfig.load(place / "tiny.toml", ["guidance.model=builtin", "geometry.steps=6"])
+    options = VOXELS | {"model": model, "sampling_steps": 2, "views": 3, "update_steps": 5}
+    given = EditTask(scene, config, tmp_path / "work", lambda line: None)
+    edited = BASELINES.make(Choice.of("in2n", options), "here", given)
+    assert edited.guidance_calls == 6 and edited.fit["fit_psnr_db"] > 15
+    base, images = edited.base_images(VIEWS, 24), edited.images(VIEWS, 24)
+    assert images.kind == base.kind == ("colour" if model else "normals")
+    assert images.values.isfinite().all() and images.mask.max() > 0.9
+    # Another call finds the last checkpoint, the edited images in it, and edits nothing more.
+    again = BASELINES.make(
+        Choice.of("in2n", options), "here", EditTask(scene, config, tmp_path / "work", lambda _: None)
+    )
+    assert torch.equal(again.grid.density, edited.grid.density)
+
+
+def test_in2n_asks_for_an_editor_where_the_guidance_is_none(scene: EditScene, place: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="name an image editor"):
+        BASELINES.make(Choice.of("in2n", VOXELS), "here", task(scene, place, tmp_path))
 
 
 def test_a_guidance_without_attention_is_refused_before_anything_is_made(
