@@ -59,6 +59,7 @@ turntable_frames = 2
 turntable_size = 32
 picture_size = 0
 sheet_every = 0
+faces = 400
 """
 VOXELS = {"resolution": 20, "samples": 24, "fit_steps": 60, "fit_views": 10, "fit_size": 32, "fit_rays": 512}
 VIEWS = CameraBatch.around(np.arange(4) * 90.0, 20.0, 3.4, 45.0)
@@ -186,6 +187,7 @@ def test_a_comparison_from_jobs_to_figures(
     place: Path, more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fd_mitsuba.runs.geometry_outcome._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.baselines.view_consistency.LATTICE_SIDE", 48)  # plenty for 32 pixels
     monkeypatch.setattr(BASELINES, "_entries", dict(BASELINES._entries))
 
     @BASELINES.register("broken")
@@ -218,9 +220,11 @@ def test_a_comparison_from_jobs_to_figures(
     record = json.loads((tmp_path / "compare.json").read_text())
     assert [job["state"] for job in record["jobs"]] == states
     assert record["jobs"][0]["result"] == ours
-    columns = len(SEEN_AT) * 160
     with Image.open(tmp_path / "compare.png") as figure:
-        assert figure.size[0] == columns * 5
+        assert figure.size == (5 * 160, 18 + 18 + len(SEEN_AT) * 160)
+        # What is shown fills the tiles: all views are cut to what any of them shows.
+        tiles = np.asarray(figure)[36:].max(axis=2).reshape(len(SEEN_AT), 160, 5, 160) > 60
+        assert max(np.ptp(found) for found in np.nonzero(tiles.any(axis=(0, 2)))) > 120
     rows = compare_rows(found.results, found.methods)
     cells = {row[0]: dict(zip(compare_header(), row, strict=True)) for row in rows}
     assert cells["fantasia3d"]["paper CLIP_sim"] == "0.284" and cells["broken"]["results"] == "0"

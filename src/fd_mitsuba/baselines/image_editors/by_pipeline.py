@@ -93,7 +93,7 @@ class PipelineEdit(EditedViews):
         """DDIM over the timesteps up to a share of all, in as many steps."""
         import diffusers
 
-        scheduler = diffusers.DDIMScheduler.from_config(self._scheduler.config)
+        scheduler: Any = diffusers.DDIMScheduler.from_config(self._scheduler.config)
         most = round(level * scheduler.config.num_train_timesteps)
         scheduler.register_to_config(num_train_timesteps=max(most, self.steps))
         return scheduler

@@ -85,12 +85,12 @@ class PriorEdit(EditedViews):
         texts = guidance.embeddings(single_view_prompts(guidance, cameras), self._coefficients)
         inside = self.region_mask(cameras, side, self._margin).to(guidance.device) if self._repaints else None
         rows = []
-        for begin in range(0, count, VIEWS_AT_ONCE):
-            few = slice(begin, begin + VIEWS_AT_ONCE)
+        for at in range(0, count, VIEWS_AT_ONCE):
+            few = slice(at, at + VIEWS_AT_ONCE)
             condition = guidance.seen_base(pictures[few], "coarse") if guidance.has_image_pass else None
             held = None if inside is None else (inside[few], known[few])
             own = {name: text[few] for name, text in texts.items()}
-            seed = seed_for(self.task.config.seed, Purpose.PIXELS, begin)
+            seed = seed_for(self.task.config.seed, Purpose.PIXELS, at)
             rows.append(sample(guidance, own, self._coefficients, condition, self.steps, noise[few], held, seed, first))
         latents = torch.cat(rows).float().cpu()
         mask = (latents[:, 3:] + 1) / 2 if guidance.latents.signed_mask else latents[:, 3:]
