@@ -146,7 +146,7 @@ def load_editor(task: EditTask, kind: str, model: str, controlnet: str = "") -> 
     """
     import diffusers
 
-    folder = locate(model)
+    folder = locate(model, setting="the method's model")
     parts: dict[str, Any] = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
     device = require_device(own_device(task.config.guidance.device))
     diffusers.utils.logging.disable_progress_bar()
