@@ -131,14 +131,17 @@ def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     return replace(loaded, words=dict(words), image_prompt=picture)
 
 
-def locate(model: str, appearance: bool = False) -> Path:
+def locate(model: str, appearance: bool = False, setting: str = "guidance.model") -> Path:
     """The folder of a model name: `builtin`, an existing folder, or a snapshot of a hub id (fetched, unless offline).
 
     `HF_HUB_OFFLINE=1` keeps to what is in the hub's cache.
+
+    Args:
+        setting: what names the model, for messages.
     """
     if (shipped := shipped_folder(model, appearance)) is not None:
         return builtin_folder(shipped)
-    folder = local_folder(model, "guidance.model", "Stable-Diffusion layout")
+    folder = local_folder(model, setting, "Stable-Diffusion layout")
     return _snapshot(model) if folder is None else folder
 
 
