@@ -97,6 +97,8 @@ def export_assets(
         record["faces"], record["levels"] = face_budgets[0], list(face_budgets[1:])
     if scene.surroundings:
         record["surroundings"] = scene.surroundings_ids
+    if scene.unit is not None:  # the exported scene has no `dual_path` that could say it
+        record["unit"] = scene.unit
     content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write, say)
     for exporter in exporters:
         exporter.write(content)
