@@ -312,7 +312,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "STL cut short": ("a.stl", (ASSETS / "duck.stl").read_bytes()[:-7], "cut short"),
     "OFF cut short": ("a.off", b"OFF\n8 6 0\n0 0 0\n", "announces 8 vertices"),
     "an unknown format": ("a.fbx", b"Kaydara", "export it as GLB"),
-    "3DS": ("a.3ds", b"MM", "export it as GLB"),
+    "FBX": ("a.fbx", b"MM", "export it as GLB"),
 }  # fmt: skip
 
 
