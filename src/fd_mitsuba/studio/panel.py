@@ -110,9 +110,10 @@ class Panel:
         self.change_buttons = self._gui.add_button_group("Change", tuple(_STEPS))
         self.change_buttons.on_click(self._heard(lambda event: actions[_STEPS[event.target.value]](event)))
         self.check = self._gui.add_markdown("checking...")
+        icon: Any = "file-upload"
         self._gui.add_upload_button(
             "Open a mesh file",
-            icon="file-upload",
+            icon=icon,
             mime_type=",".join(READERS),
             hint="such as a GLB; it becomes the base of another round",
         )
