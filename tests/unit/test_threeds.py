@@ -146,6 +146,8 @@ def test_it_becomes_a_scene_that_stands_upright(tmp_path: Path, tiles: np.ndarra
 
 BAD = FACES.copy()
 BAD[3, 1] = 8
+HOLED = CUBE.copy()
+HOLED.view("<u4")[2, 1] = 0x7F800001  # a NaN that tells of itself when it is widened
 
 
 @pytest.mark.parametrize(
@@ -160,6 +162,7 @@ BAD[3, 1] = 8
         (chunk(0x4D4D, chunk(0x3D3D, chunk(0x4000, text("a"), chunk(0x4100, chunk(0x4110, b"\3\0a"))))), "cut short"),
         (chunk(0x4D4D, chunk(0x3D3D, box(BAD))), "'Kiste': face 3 names a vertex of 8 that is not there"),
         (chunk(0x4D4D, chunk(0x3D3D, box(FACES[:9]))), "material 'Fliese' is of a face that is not there"),
+        (chunk(0x4D4D, chunk(0x3D3D, box(points=HOLED))), "'Kiste' has positions that are NaN or infinite"),
         (chunk(0x4D4D, chunk(0x3D3D)), "has no faces"),
     ],
 )  # fmt: skip

@@ -23,6 +23,8 @@ _MAIN, _EDITOR, _KEY_FRAMES = 0x4D4D, 0x3D3D, 0xB000
 _MATERIAL, _OBJECT, _TRIANGLES = 0xAFFF, 0x4000, 0x4100
 _POINTS, _FACES, _UVS, _MATRIX = 0x4110, 0x4120, 0x4140, 0x4160
 _FACE_MATERIAL, _SMOOTHING = 0x4130, 0x4150
+_FAR, _SHEET = 1e12, 1e-12
+"""Numbers of a matrix beyond or below which it mirrors nothing."""
 
 
 @dataclass
@@ -80,17 +82,18 @@ def _mesh(name: str, data: memoryview) -> _Mesh:
     found = _Mesh(name)
     for kind, part in chunks(data):
         if kind == _POINTS:
-            found.vertices = rows_of(part, "<f4", 3)[0].astype(np.float64)
+            found.vertices = rows_of(part, "<f4", 3)[0]
         elif kind == _UVS:
-            uvs = np.nan_to_num(rows_of(part, "<f4", 2)[0].astype(np.float64), posinf=0.0, neginf=0.0)
+            uvs = np.nan_to_num(rows_of(part, "<f4", 2)[0], posinf=0.0, neginf=0.0)
             found.uvs = np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1)
         elif kind == _MATRIX:
             if len(part) < 48:
                 raise BrokenAsset(CUT_SHORT)
-            found.matrix = np.frombuffer(part[:48], "<f4").reshape(4, 3).astype(np.float64)
+            with np.errstate(invalid="ignore"):
+                found.matrix = np.frombuffer(part[:48], "<f4").reshape(4, 3).astype(np.float64)
         elif kind == _FACES:
             table, rest = rows_of(part, "<u2", 4)  # three corners, and which edges are drawn
-            found.faces = table[:, :3].astype(np.int64)
+            found.faces = table[:, :3]
             for inner, body in chunks(rest):
                 if inner == _SMOOTHING:
                     if len(body) < 4 * len(table):
@@ -98,7 +101,7 @@ def _mesh(name: str, data: memoryview) -> _Mesh:
                     found.groups = np.frombuffer(body[: 4 * len(table)], "<u4")
                 elif inner == _FACE_MATERIAL:
                     title, list_ = text_of(body)
-                    found.materials.append((title, rows_of(list_, "<u2")[0][:, 0].astype(np.int64)))
+                    found.materials.append((title, rows_of(list_, "<u2")[0][:, 0]))
     _check(found)
     return found
 
@@ -109,12 +112,14 @@ def _check(mesh: _Mesh) -> None:
         face = int(np.argmax(mesh.faces.max(axis=1) >= len(mesh.vertices)))
         count = len(mesh.vertices)
         raise BrokenAsset(f"object {mesh.name!r}: face {face} names a vertex of {count} that is not there; export anew")
+    if not np.isfinite(mesh.vertices).all():
+        raise BrokenAsset(f"object {mesh.name!r} has positions that are NaN or infinite; export anew")
     for title, faces in mesh.materials:
         if len(faces) and faces.max() >= len(mesh.faces):
             raise BrokenAsset(f"object {mesh.name!r}: material {title!r} is of a face that is not there; export anew")
     if mesh.uvs is not None and len(mesh.uvs) != len(mesh.vertices):
         mesh.uvs = None
-    if mesh.matrix is not None and np.isfinite(mesh.matrix).all() and np.linalg.det(mesh.matrix[:3]) < 0:
+    if mesh.matrix is not None and np.abs(mesh.matrix).max() < _FAR and np.linalg.det(mesh.matrix[:3]) < -_SHEET:
         # A mirrored object is stored as it was before it was mirrored.
         axes, centre = mesh.matrix[:3], mesh.matrix[3]
         own = (mesh.vertices - centre) @ np.linalg.inv(axes)

@@ -38,7 +38,8 @@ def text_of(data: memoryview) -> tuple[str, memoryview]:
 
 
 def rows_of(data: memoryview, kind: str, width: int = 1) -> tuple[np.ndarray, memoryview]:
-    """The table that a chunk begins with, after the two-byte number of its rows, and what stands behind it.
+    """The table (rows, width), float64 or int64, that a chunk begins with behind the two-byte number of its rows, and
+    what stands behind it.
 
     Args:
         kind: of its numbers, such as "<f4".
@@ -48,7 +49,10 @@ def rows_of(data: memoryview, kind: str, width: int = 1) -> tuple[np.ndarray, me
     size = 2 + count * width * np.dtype(kind).itemsize
     if size > len(data):
         raise BrokenAsset(CUT_SHORT)
-    return np.frombuffer(data[2:size], kind).reshape(count, width), data[size:]
+    table = np.frombuffer(data[2:size], kind).reshape(count, width)
+    with np.errstate(invalid="ignore"):  # some NaNs of 32 bits are told of when they get 64
+        wide = table.astype(np.float64 if table.dtype.kind == "f" else np.int64)
+    return wide, data[size:]
 
 
 def number_of(data: memoryview, kind: str) -> float:

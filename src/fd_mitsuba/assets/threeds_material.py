@@ -22,6 +22,8 @@ _FILE, _TILING, _U_SCALE, _V_SCALE, _U_OFFSET, _V_OFFSET, _ANGLE = (
     0xA300, 0xA351, 0xA354, 0xA356, 0xA358, 0xA35A, 0xA35C,
 )  # fmt: skip
 _MIRROR, _ONCE = 0x02, 0x10
+_LARGEST = 1e6
+"""Of a scale, offset or angle that is one."""
 
 
 def read_material(data: memoryview, folder: Path, notes: list[str]) -> AssetMaterial:
@@ -60,7 +62,8 @@ def _colour(data: memoryview) -> tuple[float, float, float]:
     known: dict[int, np.ndarray] = {}
     for kind, part in chunks(data):
         if kind in (_FLOATS, _LINEAR_FLOATS) and len(part) >= 12:
-            known[kind] = np.frombuffer(part[:12], "<f4").astype(np.float64)
+            with np.errstate(invalid="ignore"):
+                known[kind] = np.frombuffer(part[:12], "<f4").astype(np.float64)
         elif kind in (_BYTES, _LINEAR_BYTES) and len(part) >= 3:
             known[kind] = np.frombuffer(part[:3], np.uint8) / 255.0
     for kind in (_FLOATS, _BYTES, _LINEAR_FLOATS, _LINEAR_BYTES):
@@ -89,7 +92,7 @@ def _texture(data: memoryview, folder: Path, material: str, notes: list[str]) ->
             name = text_of(part)[0]
         elif kind == _TILING:
             flags = int(number_of(part, "<H"))
-        elif kind in numbers and np.isfinite(value := number_of(part, "<f")):
+        elif kind in numbers and abs(value := number_of(part, "<f")) < _LARGEST:
             numbers[kind] = value
     if not name:
         return None
