@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 
+from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 from fd_mitsuba.export.final_surface.part_function import PartFunction
-from fd_mitsuba.export.final_surface.projection import project
-from fd_mitsuba.export.final_surface.remesh import remesh, tidied
+from fd_mitsuba.export.final_surface.projection import FLATTEST, project
+from fd_mitsuba.export.final_surface.remesh import halved, remesh, tidied, unfolded
 from fd_mitsuba.export.final_surface.rim import drawn_to_rim, without_crossings
+from fd_mitsuba.export.final_surface.slivers import without_slivers
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 
 _SHORTEST_CELLS = 0.2
@@ -21,6 +23,13 @@ _TRIES = 3
 _RIM_ROUNDS = 3
 _LEAST_ANGLE_DEG = 12.0
 _LEAST_AT_RIM_DEG = 6.0
+_MAY_MOVE_CELLS = 0.05
+"""How far from where it was the surface may be for the sake of better triangles, in cells of the training."""
+_REFINEMENTS = 2
+_OFF_CELLS = 0.07
+"""Where an edge's middle is farther from the zero set, in cells of the training, the edge is halved: as in creases."""
+_FAR_SHORTER, _MOST_HALVED = 0.5, 0.03
+"""Unless it is shorter than this share of the others; and not more at once than this share of the triangles."""
 
 
 def edge_for(vertices: np.ndarray, triangles: np.ndarray, faces: int, cell: float) -> float:
@@ -71,17 +80,43 @@ def evenly_meshed(
     for _ in range(2):
         near, triangles = tidied(near, triangles, edge)
         near = without_crossings(function.rim, near, triangles, edge, _LEAST_AT_RIM_DEG)
-    exact, _, distance = project(function.with_gradient, near, step, 12, 1e-4 * cell)
-    return _without_slivers(near, exact, triangles), triangles, distance
+    return _closely(function, near, triangles, edge, faces, step)
 
 
-def _without_slivers(before: np.ndarray, after: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """`after`, but where triangles have become slivers their corners are as `before`, which is nearly as exact."""
-    moved = after.copy()
-    for _ in range(_TRIES):
-        thin = smallest_angles(moved, triangles) < _LEAST_ANGLE_DEG
-        if not thin.any():
+def _closely(
+    function: PartFunction, vertices: np.ndarray, triangles: np.ndarray, edge: float, faces: int, step: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh with every vertex on the zero set, edges whose middles are off it halved, and without slivers.
+
+    Edges are halved only as long as that leaves at most `faces` triangles.
+    """
+    cell = function.grid.spacing
+
+    def onto(vertices: np.ndarray, triangles: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        tried = vertices.copy()
+        tried[moved] = project(function.with_gradient, vertices[moved], step, 12, 1e-4 * cell)[0]
+        return unfolded(vertices, tried, triangles, np.minimum(smallest_angles(vertices, triangles), _LEAST_ANGLE_DEG))
+
+    vertices = onto(vertices, triangles, np.ones(len(vertices), dtype=bool))
+    for number in range(_REFINEMENTS + 1):
+        vertices, triangles, moved = without_slivers(vertices, triangles, _LEAST_ANGLE_DEG, _MAY_MOVE_CELLS * cell)
+        vertices = onto(vertices, triangles, moved)
+        if number == _REFINEMENTS:
             break
-        corners = np.unique(triangles[thin])
-        moved[corners] = before[corners]
-    return moved
+        edges = edges_of(triangles, len(vertices))
+        middles = vertices[edges.ends].mean(axis=1)
+        lengths = np.linalg.norm(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]], axis=1)
+        doubtful = np.abs(function.values(middles)) > FLATTEST * _OFF_CELLS * cell
+        tried_at = np.flatnonzero(doubtful & (lengths > _FAR_SHORTER * edge))
+        off = function.distance(middles[tried_at])
+        room = min((faces - len(triangles)) // 2, int(_MOST_HALVED * len(triangles)))
+        worst = np.argsort(-off, kind="stable")[: max(room, 0)]
+        worst = worst[off[worst] > _OFF_CELLS * cell]
+        if not len(worst):
+            break
+        long = np.zeros(len(edges.ends), dtype=bool)
+        long[tried_at[worst]] = True
+        count = len(vertices)
+        vertices, triangles = halved(vertices, triangles, edges, long)
+        vertices = onto(vertices, triangles, np.arange(len(vertices)) >= count)
+    return vertices, triangles, function.distance(vertices)
