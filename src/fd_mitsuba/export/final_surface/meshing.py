@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import igl
 import numpy as np
 
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
@@ -18,6 +19,8 @@ _SHORTEST_CELLS = 0.2
 """Shorter edges than this, in cells of the training, show nothing more: the field's own cells are twice a cell."""
 _MESHED = 0.9
 """Share of the budget that is aimed at: how many faces come out is known only afterwards."""
+_THINNED, _WORTH_THINNING = 1.4, 1.3
+"""How many times the triangles aimed at remeshing starts from, and how many times more there must be for that."""
 _TRIES = 3
 """Times that the edge is lengthened if there are still more faces than wanted."""
 _RIM_ROUNDS = 3
@@ -67,6 +70,7 @@ def evenly_meshed(
 
         return remesh(vertices, triangles, edge, onto, rounds)
 
+    vertices, triangles = _thinned(vertices, triangles, round(_THINNED * _MESHED * faces))
     vertices, triangles = remeshed(vertices, triangles, edge, 6)
     for _ in range(_TRIES):
         if len(triangles) <= faces:
@@ -81,6 +85,22 @@ def evenly_meshed(
         near, triangles = tidied(near, triangles, edge)
         near = without_crossings(function.rim, near, triangles, edge, _LEAST_AT_RIM_DEG)
     return _closely(function, near, triangles, edge, faces, step)
+
+
+def _thinned(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its shortest edges collapsed until about `count` triangles are left, if those are clearly fewer.
+
+    A marched surface has five times as many as are wanted; remeshing would take longer over these than over the rest.
+    """
+    if len(triangles) < _WORTH_THINNING * count:
+        return vertices, triangles
+    fewer, left, _, _ = igl.decimate(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), count)
+    left = np.asarray(left, dtype=np.int64)
+    try:
+        edges_of(left, len(fewer))
+    except ValueError:
+        return vertices, triangles
+    return np.asarray(fewer, dtype=np.float64), left
 
 
 def _closely(

@@ -111,11 +111,11 @@ class PartFunction:
         values, slopes = self.with_gradient(points)
         return np.abs(values) / np.maximum(np.linalg.norm(slopes, axis=1), FLATTEST)
 
-    def rim(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rim(self, points: np.ndarray, within: float) -> tuple[np.ndarray, np.ndarray]:
         """Two values (N, 2), and gradients (N, 2, 3), that are 0 along the rim where the solid dives under the base.
 
         The first is how much further than `reach` from the part, the second 0 on the surface as if it did not dive.
-        Infinite, with gradients of 0, where no base is near.
+        Infinite, with gradients of 0, where no base is near, or the first is larger than `within`, canonical units.
         """
         points = np.asarray(points, dtype=np.float64)
         values, gradients = np.full((len(points), 2), np.inf), np.zeros((len(points), 2, 3))
@@ -123,8 +123,11 @@ class PartFunction:
             return values, gradients
         x = torch.from_numpy(points.astype(np.float32))
         near = np.flatnonzero(self._nearest(self.base_lattice, x) > -2 * self.grid.spacing)
+        from_part, slope = self.contact.at(points[near])
+        close = np.abs(from_part - self.reach) <= within
+        near = near[close]
         x = x[torch.from_numpy(near)].requires_grad_()
-        away = _attached(x, *self.contact.at(x.detach().double().numpy()))
+        away = _attached(x, from_part[close], slope[close])
         for number, value in enumerate(
             [away - self.reach, self._joined(self._base_at(x), self._part(x, True), away, 0)]
         ):
@@ -243,8 +246,8 @@ class PartFunction:
             return torch.from_numpy(value)
         gradient = np.empty_like(points)
         for axis, step in enumerate(np.eye(3) * _STEP):
-            ahead, behind = union_sdf(list(regions), points + step), union_sdf(list(regions), points - step)
-            gradient[:, axis] = (ahead.astype(np.float64) - behind) / (2 * _STEP)
+            # One-sided: half the time for an error of half a step over the region's radius.
+            gradient[:, axis] = (union_sdf(list(regions), points + step).astype(np.float64) - value) / _STEP
         return _attached(x, value, gradient)
 
 
