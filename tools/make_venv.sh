@@ -25,4 +25,4 @@ if [ -n "${TORCH_INDEX:-}" ]; then
 else
     "${pip[@]}" install "${TORCH:-torch==2.13.0}"
 fi
-"${pip[@]}" install -e '.[dev,docs,studio]'
+"${pip[@]}" install -e '.[dev,docs,studio,usd]'

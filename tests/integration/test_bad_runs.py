@@ -129,6 +129,11 @@ def test_missing_scene(command: str, tmp_path: Path, capfd: pytest.CaptureFixtur
     assert code == 1 and "none.xml: no such scene file" in line
 
 
+def test_preview_wants_a_folder(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["preview", "scene.xml", "-o", str(tmp_path / "out.png")]) == 1
+    assert "out.png: names the folder of the images" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("place", "mode"),
     [

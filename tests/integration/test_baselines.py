@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,15 +20,21 @@ from fd_mitsuba.baselines.compare import compare, compare_jobs
 from fd_mitsuba.baselines.fantasia3d import Fantasia3dSettings, WholeObjectStage, fit_error
 from fd_mitsuba.baselines.figures import SEEN_AT
 from fd_mitsuba.baselines.interface import EditedMesh, EditTask, mesh_images
+from fd_mitsuba.baselines.jobs import CompareJob
 from fd_mitsuba.baselines.measuring import CompareProtocol
 from fd_mitsuba.baselines.methods import BASELINES
+from fd_mitsuba.baselines.processes import run_processes
 from fd_mitsuba.baselines.table import compare_header, compare_rows
-from fd_mitsuba.baselines.voxe import VoxeGlobalSettings, fitted_grid
+from fd_mitsuba.baselines.voxe import VoxeGlobalSettings
 from fd_mitsuba.baselines.voxels.edit_stage import loss_correlation
-from fd_mitsuba.cli.main import main
+from fd_mitsuba.baselines.voxels.fitting import base_shown, fitted_grid
+from fd_mitsuba.cli.compare import process_of
+from fd_mitsuba.cli.main import command_parser, main
+from fd_mitsuba.cli.scene_options import chosen_settings
 from fd_mitsuba.config import RunConfig, Section
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import NoSettings
+from fd_mitsuba.config.toml_reading import read_choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.guidance.sources import GUIDANCES
@@ -51,6 +59,7 @@ turntable_frames = 2
 turntable_size = 32
 picture_size = 0
 sheet_every = 0
+faces = 400
 """
 VOXELS = {"resolution": 20, "samples": 24, "fit_steps": 60, "fit_views": 10, "fit_size": 32, "fit_rays": 512}
 VIEWS = CameraBatch.around(np.arange(4) * 90.0, 20.0, 3.4, 45.0)
@@ -141,7 +150,7 @@ def test_voxe_global_fits_the_base_and_grows_where_the_guidance_wants_it(
     )
     after, before = (float(images(VIEWS, 24).mask.mean()) for images in (edited.images, edited.base_images))
     assert after > 1.05 * before > 0
-    base, _ = fitted_grid(VoxeGlobalSettings(**options), scene, 0)
+    base, _ = fitted_grid(VoxeGlobalSettings(**options), base_shown(scene), 0)
     away = [loss_correlation(found.grid.density, base.density).item() for found in (held, edited)]
     assert 1.5 * away[0] < away[1], "the correlation loss holds the grid to the base"
     assert edited.mesh is not None and edited.mesh.volume() > 0
@@ -178,6 +187,7 @@ def test_a_comparison_from_jobs_to_figures(
     place: Path, more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fd_mitsuba.runs.geometry_outcome._write_turntable", lambda *_: None)
+    monkeypatch.setattr("fd_mitsuba.baselines.view_consistency.LATTICE_SIDE", 48)  # plenty for 32 pixels
     monkeypatch.setattr(BASELINES, "_entries", dict(BASELINES._entries))
 
     @BASELINES.register("broken")
@@ -210,13 +220,18 @@ def test_a_comparison_from_jobs_to_figures(
     record = json.loads((tmp_path / "compare.json").read_text())
     assert [job["state"] for job in record["jobs"]] == states
     assert record["jobs"][0]["result"] == ours
-    columns = len(SEEN_AT) * 160
     with Image.open(tmp_path / "compare.png") as figure:
-        assert figure.size[0] == columns * 5
+        assert figure.size == (5 * 160, 18 + 18 + len(SEEN_AT) * 160)
+        # What is shown fills the tiles: all views are cut to what any of them shows.
+        tiles = np.asarray(figure)[36:].max(axis=2).reshape(len(SEEN_AT), 160, 5, 160) > 60
+        assert max(np.ptp(found) for found in np.nonzero(tiles.any(axis=(0, 2)))) > 120
     rows = compare_rows(found.results, found.methods)
     cells = {row[0]: dict(zip(compare_header(), row, strict=True)) for row in rows}
     assert cells["fantasia3d"]["paper CLIP_sim"] == "0.284" and cells["broken"]["results"] == "0"
     assert "| focaldreamer | 0.329 | 0.0519 |" in (tmp_path / "compare.md").read_text()
+    page = (tmp_path / "compare.html").read_text()
+    assert '<td>fantasia3d</td><td class="number">0.284</td>' in page and "RuntimeError: a fault" in page
+    assert page.count('src="data:image/') == 1 and "http" not in page.replace("http-equiv", "")
 
     # What is finished is read again, and other settings are not mixed with it.
     monkeypatch.setattr(jobs_module, "measure", lambda *_: pytest.fail("measured again"))
@@ -226,6 +241,33 @@ def test_a_comparison_from_jobs_to_figures(
     (again,) = compare_jobs([place / "scene.xml"], [Choice.of("fantasia3d")], [3], other, tmp_path)
     (refused,) = compare([again], MeanColour(), protocol, tmp_path, said.append).outcomes
     assert refused.state == "failed" and "other settings" in refused.message
+
+
+def test_jobs_as_processes_of_a_batch(place: Path, tmp_path: Path) -> None:
+    """A process is told the same job in words; one that fails costs its own result, and is not tried again."""
+    words = ["compare", str(place / "scene.xml"), "--methods", "fantasia3d {lambda_volume = 2.0}", "--seeds", "4"]
+    words += ["-c", str(place / "tiny.toml"), "--set", "geometry.steps=5", "-o", str(tmp_path)]
+
+    def jobs_of(words: list[str]) -> tuple[list[CompareJob], argparse.Namespace, list[Choice]]:
+        options = command_parser().parse_args(words)
+        methods = [read_choice(text) for text in options.methods]
+        scenes, config = [Path(scene) for scene in options.scenes], chosen_settings(options).config
+        return compare_jobs(scenes, methods, options.seeds, config, Path(options.output)), options, methods
+
+    (job,), options, methods = jobs_of([*words, "--views", "12", "--size", "32", "--workers", "2"])
+    process = process_of(options, methods)(job)
+    (same,), given, _ = jobs_of(process.words(1))
+    assert (same.task_key(), same.folder) == (job.task_key(), job.folder)
+    assert given.one and (given.views, given.size, given.threads) == (12, 32, 1)
+
+    protocol, said = CompareProtocol(12, 32), []
+    broken = (sys.executable, "-c", "print('fd_mitsuba: error: it broke'); exit(1)")
+    outcomes = run_processes(
+        [job], process_of(options, methods), MeanColour(), protocol, tmp_path, 2, 1, said.append, broken
+    )
+    assert [(outcome.state, outcome.message) for outcome in outcomes] == [("failed", "it broke")]
+    found = compare([job], MeanColour(), protocol, tmp_path, said.append, tried={job.name: "it broke"})
+    assert not found.whole and said[-1] == f"[1/1] {job.name}: failed: it broke" and not job.folder.exists()
 
 
 def test_bad_input_is_one_line(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,20 +301,46 @@ def test_three_steps_of_every_method_with_every_layout(
         "geometry.views=4",
     ]
     config = RunConfig.load(place / "tiny.toml", overrides)
-    for name in ("fantasia3d", "voxe_global", "voxe"):
+    seen = {"attention_views": 2}
+    methods = {"fantasia3d": {}, "dreameditor": seen, "voxe_global": VOXELS, "voxe": VOXELS | seen}
+    for name, options in methods.items():
         given = EditTask(scene, config, tmp_path / name, lambda line: None)
-        options = VOXELS if name == "voxe_global" else VOXELS | {"attention_views": 2} if name == "voxe" else {}
         edited = BASELINES.make(Choice.of(name, options), "here", given)
         # Two views whose attention is recorded, or two draws of noise for each.
-        extra = 0 if name != "voxe" else 4 if kind == "builtin" else 2
+        extra = 0 if options is not seen and name != "voxe" else 4 if kind == "builtin" else 2
         assert given.guidance.calls == 3 and edited.guidance_calls == 3 + extra
         images = edited.images(VIEWS, 24)
         assert images.values.isfinite().all() and images.mask.max() > 0.9
     assert 0 < edited.fit["edited_share"] < 1
     # What is not labelled is the base's again: less is changed than without the refinement.
-    base, _ = fitted_grid(VoxeGlobalSettings(**VOXELS), scene, 0)
+    base, _ = fitted_grid(VoxeGlobalSettings(**VOXELS), base_shown(scene), 0)
     same = (edited.grid.density == base.density).float().mean()
     assert same > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["builtin", "ip2p"])
+def test_three_updates_of_instruct_nerf2nerf(kind: str, scene: EditScene, place: Path, tmp_path: Path) -> None:
+    """The guidance model edits normals; a pipeline edits the base under its light, and the grid has colours."""
+    model = "" if kind == "builtin" else str(save_pipeline(kind, tmp_path / kind))
+    config = RunConfig.load(place / "tiny.toml", ["guidance.model=builtin", "geometry.steps=6"])
+    options = VOXELS | {"model": model, "sampling_steps": 2, "views": 3, "update_steps": 5}
+    given = EditTask(scene, config, tmp_path / "work", lambda line: None)
+    edited = BASELINES.make(Choice.of("in2n", options), "here", given)
+    assert edited.guidance_calls == 6 and edited.fit["fit_psnr_db"] > 15
+    base, images = edited.base_images(VIEWS, 24), edited.images(VIEWS, 24)
+    assert images.kind == base.kind == ("colour" if model else "normals")
+    assert images.values.isfinite().all() and images.mask.max() > 0.9
+    # Another call finds the last checkpoint, the edited images in it, and edits nothing more.
+    again = BASELINES.make(
+        Choice.of("in2n", options), "here", EditTask(scene, config, tmp_path / "work", lambda _: None)
+    )
+    assert torch.equal(again.grid.density, edited.grid.density)
+
+
+def test_in2n_asks_for_an_editor_where_the_guidance_is_none(scene: EditScene, place: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="name an image editor"):
+        BASELINES.make(Choice.of("in2n", VOXELS), "here", task(scene, place, tmp_path))
 
 
 def test_a_guidance_without_attention_is_refused_before_anything_is_made(

@@ -82,7 +82,9 @@ def pixels(path: Path) -> np.ndarray:
 def test_grow_kill_resume_download(make_scene: Callable[..., Path], tmp_path: Path) -> None:
     scene, work = make_scene(), tmp_path / "work"
     slow = "geometry.learning_rate=1e-6"  # so many steps of these settings would leave nothing of the part
-    served = Served(str(scene), "-o", str(work), "-c", "smoke", "--set", slow, "-t", "1")
+    slow_too = "appearance.steps=40"
+    settings = ["--set", slow, "--set", slow_too, "-t", "1"]
+    served = Served(str(scene), "-o", str(work), "-c", "smoke", *settings)
     try:
         record = json.loads((work / "studio.json").read_text())
         start = np.array(record["regions"][0]["centre"])
@@ -113,7 +115,7 @@ def test_grow_kill_resume_download(make_scene: Callable[..., Path], tmp_path: Pa
     assert not (run / "metrics.json").exists(), "the run was over before the server was killed: take more steps"
     again = Served(str(run))
     try:
-        seen = driven("resume", again.url, tmp_path)
+        seen = driven("resume", again.url, tmp_path, learning=10)
         assert re.search(rf"stopped: geometry, step \d+ of {STEPS}", seen["before"])
     finally:
         assert again.end(signal.SIGINT) == 0

@@ -69,6 +69,16 @@ def test_a_part_of_the_same_object_is_edited_too(furnished: Make) -> None:
     assert [mesh.name for mesh in scene.base] == ["eye", "body"]
 
 
+def test_a_flat_piece_of_the_object_is_edited_too(furnished: Make) -> None:
+    pane = (
+        f'<shape type="rectangle" id="pane"><transform name="to_world"><scale value="0.05"/></transform>{GREY}</shape>'  # noqa: E501
+    )
+    scene = load_edit_scene(furnished(around=FLOOR + CRATE + pane))
+    assert [mesh.name for mesh in scene.base] == ["pane", "body"] and "floor" in scene.base_choice
+    alone = load_edit_scene(furnished(around=pane))
+    assert [mesh.name for mesh in alone.base] == ["pane", "body"] and alone.base_choice == ""
+
+
 def test_a_room_around_the_region_is_not_touched_by_it(furnished: Make) -> None:
     room = f'<shape type="cube" id="room"><transform name="to_world"><scale value="5"/></transform>{GREY}</shape>'
     assert [mesh.name for mesh in load_edit_scene(furnished(around=FLOOR + room)).base] == ["body"]

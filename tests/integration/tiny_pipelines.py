@@ -73,8 +73,12 @@ def tiny_vae() -> diffusers.AutoencoderKL:
     )
 
 
-def build_pipeline(kind: str, seed: int = 0) -> diffusers.DiffusionPipeline:
-    """`sd15` (eps), `sd21` (v, OpenCLIP-like text encoder), `ip2p` (8 channels), `inpaint` (9), `tiny_vae`."""
+def build_pipeline(kind: str, seed: int = 0, with_unet: bool = True) -> diffusers.DiffusionPipeline:
+    """`sd15` (eps), `sd21` (v, OpenCLIP-like text encoder), `ip2p` (8 channels), `inpaint` (9), `tiny_vae`.
+
+    Args:
+        with_unet: else `sd21` has none.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         common = dict(safety_checker=None, feature_extractor=None, requires_safety_checker=False)
@@ -84,7 +88,7 @@ def build_pipeline(kind: str, seed: int = 0) -> diffusers.DiffusionPipeline:
                 vae=tiny_vae(),
                 text_encoder=tiny_text_encoder(tokenizer, hidden_size=64, num_hidden_layers=3, hidden_act="gelu"),
                 tokenizer=tokenizer,
-                unet=diffusers.UNet2DConditionModel(**UNET_2_1),
+                unet=diffusers.UNet2DConditionModel(**UNET_2_1) if with_unet else None,
                 scheduler=diffusers.DDIMScheduler(
                     **BETAS, prediction_type="v_prediction", steps_offset=1, clip_sample=False, set_alpha_to_one=False
                 ),

@@ -30,6 +30,7 @@ from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import rgba_png
 from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.scene_copy import SceneCopy
 from fd_mitsuba.studio.base_glb import only_parts
 
 ROOT = Path(__file__).parents[2]
@@ -311,7 +312,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "STL cut short": ("a.stl", (ASSETS / "duck.stl").read_bytes()[:-7], "cut short"),
     "OFF cut short": ("a.off", b"OFF\n8 6 0\n0 0 0\n", "announces 8 vertices"),
     "an unknown format": ("a.fbx", b"Kaydara", "export it as GLB"),
-    "3DS": ("a.3ds", b"MM", "export it as GLB"),
+    "FBX": ("a.fbx", b"MM", "export it as GLB"),
 }  # fmt: skip
 
 
@@ -424,6 +425,29 @@ def test_a_glb_is_in_metres_and_turns_parts_about_their_joint(
     pivot = part.to_asset[:3, 3] / 0.01
     # The ball floats above the head of the figure: its joint is the nearest point of that.
     assert part.name == "part_part" and np.allclose(pivot[[0, 2]], centre[[0, 2]], atol=0.05) and pivot[1] < centre[1]
+
+
+def test_a_second_round_knows_the_unit_of_the_first(tmp_path: Path) -> None:
+    imported = fd.import_asset(ASSETS / "star.obj", tmp_path / "star", units="cm", prompt="a star with a hat")
+    scene = load_edit_scene(imported.scene)
+    vertices, faces = made.ball((0.2, 0.2, 0.2), (0, 1, 0), 6)
+    export_assets(scene, RunConfig(), {"part": PartAsset(vertices, faces)}, tmp_path / "first", ["mitsuba"], 64)
+    exported = tmp_path / "first" / "mitsuba" / "scene.xml"
+    assert "unit" not in exported.read_text()  # for stock Mitsuba
+    again = load_edit_scene(exported, prompt="a star with a horn", needs_region=False)
+    assert again.unit == "cm"
+    copied = SceneCopy.of(again)  # what a run, or the studio, keeps of it
+    for place, source in copied.files.items():
+        (tmp_path / "copy" / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "copy" / place).write_bytes(source.read_bytes())
+    kept = load_edit_scene(tmp_path / "copy" / copied.scene, prompt="a star with a horn", needs_region=False)
+    export_assets(kept, RunConfig(), {"part_2": PartAsset(vertices + 0.1, faces)}, tmp_path / "second", ["glb"], 64)
+    metres = [mesh.placed()[0] for mesh in read_asset(tmp_path / "second" / "asset.glb").meshes]
+    assert np.allclose(np.ptp(metres[0], axis=0), 0.01 * np.ptp(scene.base[0].vertices, axis=0), rtol=1e-5)
+    record = exported.with_name("stack.json")
+    record.write_text(record.read_text().replace('"cm"', '"inch"'))
+    with pytest.raises(UserError, match="stack.json: is damaged"):
+        load_edit_scene(exported, prompt="a star with a horn", needs_region=False)
 
 
 def test_a_print_is_one_watertight_solid_in_millimetres(load: Load, tmp_path: Path) -> None:

@@ -298,6 +298,24 @@ def test_memory_of_stable_diffusion_is_what_loading_it_demands(make_scene: Make)
     assert 1 <= cost.memory_mb / (demanded / 1e6) < 1.2
 
 
+def test_what_latents_of_half_the_side_take(make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of the network's seconds and of what it works in: pictures of 256 pixels instead of 512."""
+    scene, costs = load_edit_scene(make_scene()), []
+    monkeypatch.setattr("fd_mitsuba.guidance.speed.measured_speed", lambda *_: 1e11)
+    config = RunConfig.load(ROOT / "configs" / "paper.toml", [f"guidance.model={tmp_path}"])
+    (tmp_path / "unet").mkdir()
+    for entry in ("sample_size", "image_size"):
+        for side in (32, 64):
+            (tmp_path / "unet" / "config.json").write_text(json.dumps({entry: side}))
+            costs.append(estimate_cost(scene, config))
+    assert costs[:2] == costs[2:]
+    assert costs[0].seconds_per_step == pytest.approx(costs[1].seconds_per_step / 4, rel=0.2)
+    unet = {"block_out_channels": [320, 640, 1280, 1280]}
+    vae = {"block_out_channels": [128, 256, 512, 512], "layers_per_block": 2}
+    less = working_set_bytes(unet, vae, 64, 4, "float32") - working_set_bytes(unet, vae, 32, 4, "float32")
+    assert (costs[1].geometry_memory_mb - costs[0].geometry_memory_mb) * 2**20 == pytest.approx(less, rel=0.05)
+
+
 def view_in(path: Path) -> np.ndarray:
     """(size, size, 3) the first view of a preview in [0, 1], where the file says that it is."""
     with Image.open(path) as image:

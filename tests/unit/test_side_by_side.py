@@ -27,6 +27,19 @@ def test_outputs_and_gradients_are_those_of_one_call(most: int, cores: int) -> N
         assert not of_samples(product, INPUTS, most, cores).requires_grad
 
 
+@pytest.mark.parametrize(("most", "cores"), [(2, 1), (5, 1), (6, 3), (3, 2), (100, 3)])
+def test_rows_that_belong_together_are_never_parted(most: int, cores: int) -> None:
+    seen, inputs = [], tuple(whole[:6].detach() for whole in INPUTS)
+
+    def call(rows: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+        seen.append(factor.tolist())
+        return product(rows, factor)
+
+    assert torch.equal(of_samples(call, inputs, most, cores, together=2), product(*inputs))
+    assert all(len(rows) <= most and len(rows) % 2 == 0 and rows[0] % 2 == 0 for rows in seen)
+    assert sorted(sum(seen, [])) == list(range(6))
+
+
 def test_no_more_samples_at_once_than_allowed() -> None:
     lock, rows, seen = threading.Lock(), [0], []
 

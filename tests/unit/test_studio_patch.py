@@ -52,6 +52,20 @@ def test_a_moved_region_changes_its_transform_alone() -> None:
     ]
 
 
+def test_the_prompt_of_a_part_is_written_into_its_regions() -> None:
+    told = replace(HAT, prompt='a "red" hat', negative_prompt="a cap")
+    after = patched(TEXT, "s.xml", [told], [HAT])
+    assert changed_lines(TEXT, after) == [
+        '+     <string name="negative_prompt" value="a cap"/>',
+        '+     <string name="prompt" value=\'a "red" hat\'/>',
+    ]
+    other = patched(after, "s.xml", [replace(told, prompt="a hat")], [told])
+    assert changed_lines(after, other)[-1] == '+     <string name="prompt" value="a hat"/>'
+    assert patched(other, "s.xml", [HAT], [replace(told, prompt="a hat")]) == TEXT
+    new = patched(TEXT, "s.xml", [HAT, replace(told, name="horn", part="horn")], [HAT])
+    assert b'<string name="part" value="horn"/>\n    <string name="prompt" value=' in new
+
+
 def test_prompt_goes_where_it_came_from() -> None:
     after = patched(TEXT, "s.xml", [HAT], [HAT], prompt='a "cat" & $5')
     assert changed_lines(TEXT, after) == [

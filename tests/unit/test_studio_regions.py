@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.focal_region import FocalRegion, PartPrompt
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -99,6 +101,36 @@ def test_what_cannot_be_is_refused() -> None:
         regions.remove("wing")
     with pytest.raises(ValueError):
         CENTRED.moved((0.0, float("nan"), 0.0))
+
+
+def test_a_prompt_is_that_of_a_part() -> None:
+    regions = region_list(SIDE, replace(CENTRED, part="hat", prompt="a hat"))
+    image = regions.mirror("wing", 1)
+    regions.put(replace(image, prompt="wings"))
+    regions.put(replace(SIDE, prompt="bat wings"))  # each region of the part that says something says the same
+    assert [pose.prompt for pose in regions.poses.values()] == ["bat wings", "a hat", "bat wings"]
+    found = {region.name: region.prompt for region in regions.focal_regions()}
+    assert found["crest"] == PartPrompt("a hat") and found["wing"] == found[image.name] == PartPrompt("bat wings")
+    regions.remove("wing")
+    regions.put(replace(regions.poses[image.name], part="hat"))  # now of a part that has its words
+    assert regions.poses[image.name].prompt == "a hat"
+    regions.put(replace(regions.poses["crest"], prompt=""))
+    assert not any(pose.prompt for pose in regions.poses.values())
+    with pytest.raises(UserError, match="1001 letters"):
+        regions.put(replace(regions.poses["crest"], prompt="x" * 1001))
+    vertices, faces = unit_sphere(1)
+    ball = FocalRegion("ball", np.eye(4), "hat", TriangleMesh("ball", vertices, faces), prompt=PartPrompt("a cap"))
+    regions.meshes["ball"] = ball
+    with pytest.raises(UserError, match="ball, a mesh of the same part, has the prompt 'a cap'"):
+        regions.put(replace(regions.poses["crest"], prompt="a crown"))
+
+
+def test_words_stay_with_the_part_whose_region_goes() -> None:
+    regions = region_list(replace(SIDE, prompt="wings", negative_prompt="feathers"))
+    image = regions.mirror("wing", 0)
+    regions.poses[image.name] = replace(image, prompt="", negative_prompt="")
+    regions.remove("wing")
+    assert regions.focal_regions()[0].prompt == PartPrompt("wings", "feathers")
 
 
 def test_record_round_trip() -> None:

@@ -8,11 +8,14 @@ import signal
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.gltf import GltfMesh, glb_bytes
@@ -111,6 +114,38 @@ def test_live_part_is_the_region_at_the_start(make_scene, mi) -> None:
     distance = np.abs(scene.regions[0].sdf(scene.frame.to_canonical(vertices)))
     assert len(faces) > 50 and faces.max() == len(vertices) - 1
     assert np.median(distance) < 0.01 and distance.max() < 2.1 / 24
+
+
+def test_live_material_is_what_the_field_says(make_scene, mi, tmp_path: Path) -> None:
+    scene = load_edit_scene(make_scene())
+    canonical = 0.2 * BALL + [0.0, 0.6, 0.0]
+
+    def field(points: torch.Tensor) -> SimpleNamespace:
+        one = torch.ones(len(points), 1)
+        return SimpleNamespace(base_color=points + 0.3, roughness=0.25 * one, metallic=0.75 * one)
+
+    parts = {"hat": SimpleNamespace(vertices=canonical, faces=FACES)}
+    config = RunConfig.load("smoke")
+    stage = SimpleNamespace(scene=scene, config=config, parts=parts, field=field)
+    run = RunState(tmp_path / "run")
+    events = EventWriter(run.folder)
+    runner._Material().write(stage, run.folder)
+    (run.folder / "export").mkdir()
+    (run.folder / "export" / "part_hat.ply").write_bytes(ply_bytes(scene.frame.to_user(canonical), FACES))
+    events.write("step", stage="appearance", phase="appearance", step=3, total=9)
+    run.follow()
+    bare = shown_part(run, scene.frame)
+    assert bare is not None and bare.glb is None  # the shape is ready, and nothing is learned yet
+    events.write("material", step=3)
+    run.follow()
+    shown = shown_part(run, scene.frame)
+    assert shown is not None and shown.glb is not None and shown.key != bare.key
+    (tmp_path / "shown.glb").write_bytes(shown.glb)
+    asset = read_asset(tmp_path / "shown.glb")
+    (mesh,) = asset.meshes
+    assert np.allclose(mesh.placed()[0], scene.frame.to_user(canonical), atol=1e-6)
+    assert mesh.colours is not None and np.allclose(mesh.colours, (canonical + 0.3).clip(0, 1), atol=1e-6)
+    assert (asset.materials[0].roughness, asset.materials[0].metallic) == (0.25, 0.75)
 
 
 def test_runner_tells_what_a_run_does(make_scene, mi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.io.ply import ply_bytes
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.studio.job import EventWriter
@@ -38,7 +39,9 @@ def view(make_scene, mi, tmp_path: Path) -> Iterator[View]:
     opened = open_target(make_scene(), tmp_path / "work", {}, say=lambda line: None)
     session = Session(opened, StudioSettings("smoke"), program=(sys.executable, "-I", "-c", ""))
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield View(server, session)
+    made = View(server, session)
+    yield made
+    made.close()
     server.stop()
     session.close()
 
@@ -72,8 +75,8 @@ def test_refused_input_is_told_and_taken_back(view: View) -> None:
     client = Client()
     typed(view.panel.part, "a/b", client)
     assert "cannot name a file" in client.notes[0] and view.panel.part.value == "part"
-    typed(view.panel.seed, -1, client)
-    assert "seed" in client.notes[1] and view.panel.seed.value == 0
+    typed(view.panel.runs.seed, -1, client)
+    assert "seed" in client.notes[1] and view.panel.runs.seed.value == 0
     typed(view.panel.part, "", client)  # while another name is being typed
     assert len(client.notes) == 2 and view.session.state.regions.poses["wing"].part == "part"
 
@@ -81,7 +84,7 @@ def test_refused_input_is_told_and_taken_back(view: View) -> None:
 def test_growing_part_is_shown(view: View) -> None:
     session = view.session
     name = session.grow()
-    assert view.canvas._part is None and "waits for its turn" in view.panel.status.content
+    assert not view.canvas.objects.has_part and "waits for its turn" in view.panel.runs.status.content
     run = session.queue.runs[name]
     vertices, faces = unit_sphere(2)
     run.live_mesh.write_bytes(ply_bytes(vertices, faces))
@@ -92,13 +95,53 @@ def test_growing_part_is_shown(view: View) -> None:
     events.write("mesh", step=1, faces=len(faces))
     run.follow()
     session._tell("runs")
-    shown = view.canvas._part
+    shown = view.canvas.objects._shown["part"].handle
     assert shown.vertices == pytest.approx(session.state.regions.frame.to_canonical(vertices), abs=1e-6)
-    assert "geometry, step 2 of 4" in view.panel.status.content and view.panel.bar.value == 50
-    assert view.canvas._regions["wing"].opacity < 0.2 and view.panel.stop.visible
+    assert "geometry, step 2 of 4" in view.panel.runs.status.content and view.panel.runs.bar.value == 50
+    assert view.canvas._regions["wing"].opacity < 0.2 and view.panel.runs.stop.visible
+    objects = view.canvas.objects
     view.canvas.visible["wireframe"] = True
     view.canvas.apply_visibility()
-    assert view.canvas._wires["part"][2].wireframe and view.canvas._wires["base"][2].visible
+    assert objects._shown["part"].lines.wireframe and objects._shown["base"].lines.visible
+
+
+def test_surfaces_can_be_shown_as_colours_or_normals(view: View, tmp_path: Path) -> None:
+    client, objects, vertices = Client(), view.canvas.objects, unit_sphere(2)[0]
+    box = read_asset(Path(__file__).parents[1] / "data" / "assets" / "box.glb").meshes[0]
+    objects.show_part(box.vertices, box.faces, view.session.state.regions.frame)
+    typed(view.panel.shading, "normals", client)
+    for name in ("base", "part"):
+        (tmp_path / f"{name}.glb").write_bytes(objects._shown[name].handle.glb_data)
+    asset = read_asset(tmp_path / "part.glb")
+    (mesh,) = asset.meshes
+    assert asset.materials[0].unlit and mesh.normals is not None and mesh.colours is not None
+    corners = mesh.vertices[mesh.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    shown = np.where(mesh.colours > 0.0031308, 1.055 * np.maximum(mesh.colours, 0) ** (1 / 2.4) - 0.055, 0)
+    assert np.allclose(shown[mesh.faces], (flat[:, None] + 1) / 2, atol=1e-3)  # a box has sharp edges
+    base = read_asset(tmp_path / "base.glb").meshes[0]
+    assert np.allclose(np.ptp(base.vertices, axis=0), np.ptp(view.session.state.base.vertices, axis=0), atol=1e-6)
+    typed(view.panel.shading, "base colour", client)
+    (tmp_path / "base.glb").write_bytes(objects._shown["base"].handle.glb_data)
+    assert all(material.unlit for material in read_asset(tmp_path / "base.glb").materials)
+    objects.show_part(vertices, unit_sphere(2)[1], view.session.state.regions.frame)  # what grows is clay even so
+    typed(view.panel.light, "sunset", client)
+    typed(view.panel.shading, "lit", client)
+    assert objects._shown["base"].handle.glb_data == view.session.state.glb and client.notes == []
+
+
+def test_a_part_has_words_of_its_own(view: View) -> None:
+    state, client = view.session.state, Client()
+    typed(view.panel.part_prompt, " bat  wings", client)
+    assert state.regions.poses["wing"].prompt == "bat wings" and view.panel.part_prompt.value == " bat  wings"
+    check = view.session.check_now()
+    assert "bat wings" in check.understood or "part: " in check.understood
+    name = view.session.mirror("wing", 1)
+    assert view.panel.region.value == name and view.panel.part_prompt.value.split() == ["bat", "wings"]
+    view.session.undo()
+    view.session.undo()
+    assert view.panel.part_prompt.value == ""
 
 
 def test_selected_region_leaves_clicks_to_its_gizmo(view: View) -> None:
@@ -117,15 +160,15 @@ def test_a_finished_result_stands_beside(view: View) -> None:
     (run.folder / "export" / "asset.glb").write_bytes(glb)
     run.state = FINISHED
     session.show("")
-    label = view.panel.beside.options[1]
-    typed(view.panel.beside, label, client)
-    handle = view.canvas._beside
+    label = view.panel.runs.beside.options[1]
+    typed(view.panel.runs.beside, label, client)
+    handle = view.canvas.objects._beside
     assert handle.glb_data == glb and client.notes == []
-    base = view.canvas._base
+    base = view.canvas.objects._shown["base"].handle
     apart = np.array(handle.position) - np.array(base.position)
     assert apart[0] > np.ptp(session.state.base.vertices[:, 0]) and apart[1:] == pytest.approx([0, 0])
-    typed(view.panel.beside, view.panel.beside.options[0], client)
-    assert view.canvas._beside is None and session.beside == ""
+    typed(view.panel.runs.beside, view.panel.runs.beside.options[0], client)
+    assert view.canvas.objects._beside is None and session.beside == ""
 
 
 def test_buttons_undo_what_was_done(view: View) -> None:

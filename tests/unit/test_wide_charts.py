@@ -10,7 +10,7 @@ from fd_mitsuba.export.bake.atlas_raster import rasterise
 from fd_mitsuba.export.bake.chart_growth import euler_numbers, grown_charts, split_chart
 from fd_mitsuba.export.bake.chart_notches import charts_of
 from fd_mitsuba.export.bake.chart_packing import packed_charts
-from fd_mitsuba.export.bake.flatten import border_loop, flattened
+from fd_mitsuba.export.bake.flatten import NotFlat, border_loops, flattened, pinched_apart
 from fd_mitsuba.export.bake.unwrap import padding_for, unwrap
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 
@@ -43,7 +43,7 @@ def test_what_can_be_unrolled_is_unrolled() -> None:
     plane, faces = disc()
     bent = np.stack([0.7 * np.sin(plane[:, 0] / 0.7), plane[:, 1], 0.7 * np.cos(plane[:, 0] / 0.7)], axis=1)
     flat = flattened(bent, faces)
-    assert flat is not None and signed_areas(flat, faces) == pytest.approx(areas(bent, faces), rel=0.01)
+    assert signed_areas(flat, faces) == pytest.approx(areas(bent, faces), rel=0.01)
     ends = np.concatenate([faces[:, :2], faces[:, 1:]])
     sides = np.linalg.norm(bent[ends[:, 0]] - bent[ends[:, 1]], axis=1)
     assert np.linalg.norm(flat[ends[:, 0]] - flat[ends[:, 1]], axis=1) == pytest.approx(sides, rel=0.01)
@@ -56,7 +56,6 @@ def test_half_a_ball_keeps_its_triangles_from_folding() -> None:
     outward = plane / np.maximum(radius, 1e-9)[:, None]
     ball = np.concatenate([outward * np.sin(angle)[:, None], np.cos(angle)[:, None]], axis=1)
     flat = flattened(ball, faces)
-    assert flat is not None
     ratio = signed_areas(flat, faces) / areas(ball, faces)
     assert ratio.min() > 0.5 and ratio.max() < 1.6
 
@@ -65,10 +64,39 @@ def test_what_is_no_disc_is_not_laid_flat() -> None:
     vertices, faces = disc()
     ring = faces[24:]
     used, local = np.unique(ring, return_inverse=True)
-    assert border_loop(local.reshape(-1, 3)) is None
-    assert flattened(np.c_[vertices[used], np.zeros(len(used))], local.reshape(-1, 3)) is None
-    closed = marched(torus, 20)
-    assert flattened(*closed) is None
+    ring = local.reshape(-1, 3)
+    assert sorted(len(loop) for loop in border_loops(ring)) == [24, 24]
+    with pytest.raises(NotFlat) as bad:
+        flattened(np.c_[vertices[used], np.zeros(len(used))], ring)
+    assert bad.value.apart is not None
+    one, other = (vertices[used][ring[face]].mean(axis=0) for face in bad.value.apart)
+    assert one @ other < -0.9 * np.linalg.norm(one) * np.linalg.norm(other)  # at opposite sides of the hole
+    with pytest.raises(NotFlat):
+        flattened(*marched(torus, 20))
+
+
+def test_what_would_overlap_names_two_faces_to_part() -> None:
+    """A ring-shaped strip that goes around one and a half times, as a spiral staircase does."""
+    count = 30
+    turn = 3.2 * np.pi * np.arange(count) / (count - 1)
+    rims = [np.stack([r * np.cos(turn), r * np.sin(turn), 0.001 * turn], axis=1) for r in (0.1, 1.0)]
+    first = 2 * np.arange(count - 1)
+    faces = np.concatenate([np.stack([first, first + 1, first + 2], 1), np.stack([first + 1, first + 3, first + 2], 1)])
+    with pytest.raises(NotFlat) as bad:
+        flattened(np.stack(rims, axis=1).reshape(-1, 3), faces)
+    assert bad.value.apart is not None
+    one, other = (turn[faces[face].max() // 2] for face in bad.value.apart)
+    assert abs(one - other) > np.pi
+
+
+def test_a_chart_that_touches_itself_at_a_vertex_is_a_disc_once_that_is_two() -> None:
+    vertices, faces = disc(1, 8)
+    pinched = faces[[0, 1, 4, 5]]  # two fans that meet in the middle
+    assert border_loops(pinched) == []
+    local, was = pinched_apart(pinched)
+    assert np.array_equal(was[local], pinched) and (was == 0).sum() == 2 and len(was) == len(np.unique(pinched)) + 1
+    whole, same = pinched_apart(faces)
+    assert np.array_equal(same[whole], faces) and len(same) == len(vertices)
 
 
 @pytest.mark.parametrize("name", ["ball", "torus", "cube"])
@@ -81,7 +109,7 @@ def test_charts_are_few_discs(name: str) -> None:
     assert (euler_numbers(faces, edges, chart, count) == 1).all()
     for number in range(count):
         used, local = np.unique(faces[chart == number], return_inverse=True)
-        assert flattened(vertices[used], local.reshape(-1, 3)) is not None
+        flattened(vertices[used], local.reshape(-1, 3))  # or it raises
     halves = split_chart(vertices, faces, edges, chart, 0)
     assert halves.max() == count and (halves[chart != 0] == chart[chart != 0]).all()
     assert min((halves == 0).sum(), (halves == count).sum()) > 0.2 * (chart == 0).sum()

@@ -46,6 +46,11 @@ async function type(page, label, text) {
   await field(page, label).blur();
 }
 
+async function choose(page, label, option) {
+  await field(page, label).click();
+  await page.getByRole("option", { name: option, exact: true }).click();
+}
+
 async function drag(page, from, to) {
   await page.mouse.move(...from);
   await page.waitForTimeout(500);
@@ -79,8 +84,10 @@ try {
     await open(page, "Grow");
     if (options.steps) await type(page, "Steps", String(options.steps));
     await page.waitForTimeout(1500);
+    const asked = Date.now();
     await page.getByRole("button", { name: "Grow", exact: true }).click();
-    await page.getByText(/geometry, step/).waitFor();
+    await page.getByText(/geometry, step/).waitFor(); // the part's first mesh comes with it
+    said.first_part_seconds = (Date.now() - asked) / 1000;
     await page.waitForTimeout(options.look ?? 4000);
     said.text = await page.evaluate(() => document.body.innerText);
     await picture(page, "growing");
@@ -88,6 +95,10 @@ try {
     await open(page, "Grow");
     said.before = await page.evaluate(() => document.body.innerText);
     await page.getByRole("button", { name: "Resume" }).click();
+    if (options.learning) { // a step of the material from which on to take a picture
+      await page.getByText(new RegExp(`appearance, step ${options.learning}`)).waitFor({ timeout: options.patience ?? 600000 });
+      await picture(page, "learning");
+    }
     await page.getByText("finished", { exact: true }).waitFor({ timeout: options.patience ?? 600000 });
     await page.waitForTimeout(options.settle ?? 4000);
     await picture(page, "finished");
@@ -97,7 +108,14 @@ try {
     said.download = download.suggestedFilename();
     await download.saveAs(join(folder, said.download));
   } else {
+    if (options.upload) {
+      await page.locator("input[type=file]").setInputFiles(options.upload);
+      await page.getByText(options.answer).waitFor();
+      said.notes = await page.locator(".mantine-Notification-root").allInnerTexts();
+    }
     if (options.tab) await open(page, options.tab);
+    if (options.shading) await choose(page, "Shown as", options.shading);
+    if (options.light) await choose(page, "Light", options.light);
     await page.waitForTimeout(options.settle ?? 4000);
     await picture(page, "page");
     said.text = await page.evaluate(() => document.body.innerText);

@@ -8,16 +8,19 @@ SHARP_DEG = 40.0
 """Faces that meet at a larger angle than this keep an edge between them."""
 
 
-def crease_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def crease_normals(
+    vertices: np.ndarray, faces: np.ndarray, groups: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals at corners, and the vertices that must be there twice for them.
 
     Corners are of one point where their positions are equal, so that UV seams do not show. A corner's normal is the
     mean of those of the faces around its point that make an angle of less than `SHARP_DEG` with its own face, weighted
-    by area.
+    by area. With smoothing groups it is the mean of those that have a group in common with its own face.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3).
+        groups: (F,) whole numbers, a bit a group; a face of none is flat.
 
     Returns:
         (W,) for each new vertex the old one that it is a copy of, its normal (W, 3), and the new faces (F, 3).
@@ -39,7 +42,10 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         if not len(here):
             break
         one, other = sorted_face[here], sorted_face[here + step]
-        near = np.einsum("ij,ij->i", unit[one], unit[other]) > least
+        if groups is None:
+            near = np.einsum("ij,ij->i", unit[one], unit[other]) > least
+        else:
+            near = (groups[one] & groups[other]) != 0
         np.add.at(total, here[near], area[other[near]])
         np.add.at(total, here[near] + step, area[one[near]])
     size = np.linalg.norm(total, axis=1, keepdims=True)

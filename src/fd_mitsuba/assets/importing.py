@@ -16,9 +16,9 @@ from fd_mitsuba.assets.scene_writer import SceneText, write_scene
 from fd_mitsuba.assets.shapes import SceneShape, scene_shapes
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import size_problem
-from fd_mitsuba.scene.edit_inputs import UNITS
 from fd_mitsuba.scene.enclosure import encloses_volume
 from fd_mitsuba.scene.normalisation import Normalisation
+from fd_mitsuba.scene.part_stack import UNITS
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 

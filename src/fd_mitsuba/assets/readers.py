@@ -27,6 +27,7 @@ READERS: dict[str, Callable[[Path], Asset]] = {
     ".gltf": _reader("gltf", "read_gltf"),
     ".obj": _reader("obj", "read_obj"),
     ".dae": _reader("dae", "read_dae"),
+    ".3ds": _reader("threeds", "read_3ds"),
     ".ply": _reader("ply", "read_ply_asset"),
     ".stl": _reader("plain_meshes", "read_stl"),
     ".off": _reader("plain_meshes", "read_off"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from fd_mitsuba.baselines.figures import write_comparison, write_views
 from fd_mitsuba.baselines.jobs import FAILED, FINISHED, CompareJob, JobOutcome, perform
 from fd_mitsuba.baselines.measuring import CompareProtocol
 from fd_mitsuba.baselines.methods import BASELINES
+from fd_mitsuba.baselines.page import write_page
 from fd_mitsuba.baselines.table import compare_header, compare_rows
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
@@ -103,11 +104,15 @@ def compare(
     folder: Path,
     say: Callable[[str], None] = print,
     quiet: bool = True,
+    tried: Mapping[str, str] | None = None,
 ) -> Comparison:
-    """Do what is missing, and write `compare.json`, `compare.md`, `compare.png` and `compare_2d.png` into `folder`.
+    """Do what is missing, and write `compare.json`, `.md`, `.html`, `.png` and `compare_2d.png` into `folder`.
 
     A method that fails on a scene is said in one line, and the others go on. The files are brought up to date after
     every job.
+
+    Args:
+        tried: name -> message of jobs that were tried elsewhere and failed: they are not tried again.
 
     Raises:
         Interrupted: SIGINT or SIGTERM; the same call goes on.
@@ -115,7 +120,10 @@ def compare(
     methods = tuple(dict.fromkeys(job.method.kind for job in jobs))
     outcomes: list[JobOutcome] = []
     for number, job in enumerate(jobs, 1):
-        outcome = perform(job, judge, protocol, say, quiet)
+        if tried is not None and job.name in tried:
+            outcome = JobOutcome(job, FAILED, tried[job.name], None)
+        else:
+            outcome = perform(job, judge, protocol, say, quiet)
         outcomes.append(outcome)
         took = ""
         if outcome.state == FINISHED and outcome.result is not None:
@@ -128,16 +136,17 @@ def compare(
 
 def _write(found: Comparison, judge: Judge, protocol: CompareProtocol, folder: Path) -> None:
     about = {"judge": judge.name, "views": protocol.views, "size": protocol.size, "methods": list(found.methods)}
-    rows = [
+    jobs = [
         {"name": outcome.job.name, "state": outcome.state, "message": outcome.message, "result": outcome.result}
         for outcome in found.outcomes
     ]
-    write_json(folder / "compare.json", about | {"jobs": rows})
+    write_json(folder / "compare.json", about | {"jobs": jobs})
     note = (
         f"Judge: {judge.name}; {protocol.views} views of {protocol.size} pixels; mean ± standard deviation over scenes "
-        "and seeds. The paper's numbers are ViT-B/32's over its own scenes.\n\n"
+        "and seeds. The paper's numbers are ViT-B/32's over its own scenes."
     )
-    table = markdown_table(compare_header(), compare_rows(found.results, found.methods))
-    write_atomically(folder / "compare.md", (note + table).encode())
+    header, rows = compare_header(), compare_rows(found.results, found.methods)
+    write_atomically(folder / "compare.md", f"{note}\n\n{markdown_table(header, rows)}".encode())
     write_comparison(found.outcomes, folder / "compare.png")
     write_views(found.outcomes, IMAGE_EDITORS, folder / "compare_2d.png")
+    write_page(found.outcomes, header, rows, note, folder)

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from fd_mitsuba.baselines.image_editors.by_pipeline import PipelineEdit, load_editor
 from fd_mitsuba.baselines.image_editors.by_prior import PriorEdit
+from fd_mitsuba.baselines.image_editors.views import EditedViews
 from fd_mitsuba.baselines.interface import BASELINES, EditedObject, EditTask
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import GuidanceScale, ModelName
@@ -53,6 +54,15 @@ class Inpaint2dSettings(Section):
 @BASELINES.register("pix2pix_2d", Pix2Pix2dSettings)
 def pix2pix_2d(settings: Pix2Pix2dSettings, task: EditTask) -> EditedObject:
     """InstructPix2Pix on every view by itself, or the guidance model in its place; no object, only images."""
+    return pix2pix_editor(settings, task)
+
+
+def pix2pix_editor(settings: Pix2Pix2dSettings, task: EditTask) -> EditedViews:
+    """The editor of single images that the settings name.
+
+    Raises:
+        UserError: a model that cannot be loaded, or a guidance model that does not edit.
+    """
     own = task.config.guidance
     if not settings.model:
         scales = (

@@ -143,6 +143,10 @@ def fit_error(stage: WholeObjectStage) -> float:
 
     Measured from the surface's vertices to the base: small pieces of the base that fall through the grid do not count.
     """
-    base, made = stage.own.scene.base_canonical, stage.surface()
-    distance = MeshDistance(base.vertices, base.faces).unsigned(made.vertices.numpy())
-    return float(distance.max()) / stage.own.grid.spacing
+    return surface_error(stage.own, stage.surface().vertices)
+
+
+def surface_error(own: GeometryStage, vertices: Tensor) -> float:
+    """How far vertices (V, 3) are from the base's surface at most, in cells of the grid."""
+    base = own.scene.base_canonical
+    return float(MeshDistance(base.vertices, base.faces).unsigned(vertices.numpy()).max()) / own.grid.spacing

@@ -190,3 +190,9 @@ def to_camera_space(normals: Tensor, cameras: CameraBatch) -> Tensor:
     """World-space vectors (N, 3, S, S), a view each, as the cameras see them: x right, y up, z to the viewer."""
     axes = torch.from_numpy(np.stack(cameras.basis(), axis=1)).to(normals.dtype)
     return torch.einsum("nij,njhw->nihw", axes, normals)
+
+
+def to_world_space(normals: Tensor, cameras: CameraBatch) -> Tensor:
+    """The inverse of `to_camera_space`."""
+    axes = torch.from_numpy(np.stack(cameras.basis(), axis=1)).to(normals.dtype)
+    return torch.einsum("nji,njhw->nihw", axes, normals)

@@ -80,12 +80,9 @@ def perform(
         Interrupted: SIGINT or SIGTERM; the same call goes on from the last checkpoint.
     """
     try:
-        task_key = job.task_key()
-        key = _digest([task_key, judge.name, judge.version, protocol.views, protocol.size])
-        known = read_json_object(job.folder / RESULT_NAME) or {}
-        if known.get("key") == key and (job.folder / VIEWS_NAME).is_file():
+        if (known := finished_result(job, judge, protocol)) is not None:
             return JobOutcome(job, SKIPPED, "", known)
-        return JobOutcome(job, FINISHED, "", _made(job, task_key, key, judge, protocol, say, quiet))
+        return JobOutcome(job, FINISHED, "", _made(job, judge, protocol, say, quiet))
     except (Interrupted, KeyboardInterrupt):
         raise
     except UserError as error:
@@ -96,15 +93,21 @@ def perform(
         gc.collect()
 
 
+def finished_result(job: CompareJob, judge: Judge, protocol: CompareProtocol) -> dict[str, Any] | None:
+    """What is known of a job that was finished before, with these settings and by this judge; None: it was not."""
+    known = read_json_object(job.folder / RESULT_NAME) or {}
+    there = known.get("key") == _key(job, judge, protocol) and (job.folder / VIEWS_NAME).is_file()
+    return known if there else None
+
+
+def _key(job: CompareJob, judge: Judge, protocol: CompareProtocol) -> str:
+    return _digest([job.task_key(), judge.name, judge.version, protocol.views, protocol.size])
+
+
 def _made(
-    job: CompareJob,
-    task_key: str,
-    key: str,
-    judge: Judge,
-    protocol: CompareProtocol,
-    say: Callable[[str], None],
-    quiet: bool,
+    job: CompareJob, judge: Judge, protocol: CompareProtocol, say: Callable[[str], None], quiet: bool
 ) -> dict[str, Any]:
+    task_key = job.task_key()
     before = read_json_object(job.folder / TASK_NAME)
     if before is None and job.folder.exists() and any(job.folder.iterdir()):
         raise UserError(f"{job.folder}: is not empty and holds no comparison; choose another -o folder")
@@ -125,7 +128,7 @@ def _made(
         write_json(job.folder / TASK_NAME, record | {"seconds": round(spent, 1), "done": done})
     calls = task.guidance_calls if edited.guidance_calls is None else edited.guidance_calls
     result = {
-        "key": key,
+        "key": _key(job, judge, protocol),
         "scene": job.scene_name,
         "method": job.method.kind,
         "settings": job.method.options,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fd_mitsuba.baselines import editors_2d, fantasia3d, focaldreamer, voxe
+from fd_mitsuba.baselines import dreameditor, editors_2d, fantasia3d, focaldreamer, in2n, voxe
 from fd_mitsuba.baselines.interface import BASELINES
 
-__all__ = ["BASELINES", "editors_2d", "fantasia3d", "focaldreamer", "voxe"]
+__all__ = ["BASELINES", "dreameditor", "editors_2d", "fantasia3d", "focaldreamer", "in2n", "voxe"]

@@ -57,6 +57,10 @@ class Job:
         """What the run said; beside its folder, because a run that fails early leaves no folder."""
         return self.folder.with_name(f"{self.folder.name}.log")
 
+    def is_finished(self) -> bool:
+        """See the function of this name; jobs of another kind have files of their own to tell by."""
+        return is_finished(self)
+
     def settings(self) -> RunConfig:
         """The settings with overrides and seed; UserError as `settings_for_run`."""
         return settings_for_run(self.config, [*self.overrides, f"seed={self.seed}"]).config
@@ -154,7 +158,7 @@ def perform(
         token: names the batch in the log.
         stops: how often the user has asked to stop: once lets the run save its state, twice kills it.
     """
-    if is_finished(job) and not attempts(job, token):
+    if job.is_finished() and not attempts(job, token):
         metrics = read_json_object(job.folder / "metrics.json") or {}
         seconds = metrics.get("seconds")
         return Outcome(job, SKIPPED, seconds=float(seconds) if isinstance(seconds, int | float) else 0.0)
@@ -162,7 +166,7 @@ def perform(
     with open(job.log, "ab") as log:
         if not _locked(log, stops):
             return Outcome(job, INTERRUPTED, "not started", attempts=attempts(job, token))
-        if is_finished(job):  # by the process of a worker that was killed
+        if job.is_finished():  # by the process of a worker that was killed
             return Outcome(job, FINISHED, "its worker was killed, the run was not", attempts=attempts(job, token))
         started, offset = time.monotonic(), log.tell()
         words = job.words(threads)

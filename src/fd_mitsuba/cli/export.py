@@ -21,7 +21,7 @@ def add_export_commands(commands: argparse._SubParsersAction) -> None:
         nargs="+",
         default=["glb", "obj", "ply", "mitsuba"],
         metavar="FORMAT",
-        help="any of glb obj ply mitsuba, or what a plugin registers; default: those four",
+        help="any of glb obj ply mitsuba (default: those four), print, usdz, or what a plugin registers",
     )
     export.add_argument(
         "--faces",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from fd_mitsuba.cli.options import given_text, say
@@ -11,8 +12,8 @@ from fd_mitsuba.cli.scene_options import axis_options, placing_options
 
 def add_import_command(commands: argparse._SubParsersAction) -> None:
     """Put `import` beside the other commands."""
-    parser = commands.add_parser("import", help="make a scene to edit out of a GLB, OBJ, DAE, PLY, STL or OFF")
-    parser.add_argument("asset", help="mesh file: .glb .gltf .obj .ply .stl .off")
+    parser = commands.add_parser("import", help="make a scene to edit out of a GLB, OBJ, DAE, 3DS, PLY, STL or OFF")
+    parser.add_argument("asset", help="mesh file: .glb .gltf .obj .dae .3ds .ply .stl .off")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="the scene's folder; default: scenes/<asset>")
     parser.add_argument("--prompt", help="what the edited object should look like")
     parser.add_argument("--base-prompt", help="what it looks like now; default: the prompt up to its `with`")
@@ -43,4 +44,6 @@ def _import(options: argparse.Namespace) -> int:
     )
     for line in imported.lines():
         say(line)
+    wanted = "" if options.prompt else ' --prompt "..."'
+    say(f"next     fd_mitsuba run {shlex.quote(str(imported.scene))}{wanted} -o runs/{shlex.quote(path.stem)}")
     return 0

@@ -22,6 +22,8 @@ def add_preview_command(commands: argparse._SubParsersAction) -> None:
 def _preview(options: argparse.Namespace) -> int:
     misplaced: list[UserError] = []
     name = scene_label(options.scene)
+    if options.output and Path(options.output).suffix.lower() in (".png", ".jpg", ".jpeg"):
+        raise UserError(f"-o {options.output}: names the folder of the images; give it without a suffix")
     scene = load(options, misplaced.append, needs_region=False)
     from fd_mitsuba.viewing.preview import preview_scene
 

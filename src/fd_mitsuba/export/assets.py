@@ -18,6 +18,7 @@ from fd_mitsuba.export.formats import EXPORTERS, FORMATS, ExportContent, Exporte
 from fd_mitsuba.export.meshes import copy_base
 from fd_mitsuba.export.printing import Print
 from fd_mitsuba.export.ready_part import PartAsset, ready_part
+from fd_mitsuba.export.usd import Usdz
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.part_stack import SHOWN, read_stack
@@ -25,9 +26,8 @@ from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneElement
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
-PRINT = Print.leaves
-"""Of the format `print`, which is registered by its module being imported here, after those that are written by
-default."""
+FURTHER = (Print.leaves, Usdz.leaves)
+"""Of formats that are registered by their modules being imported here, after those that are written by default."""
 
 
 def export_assets(
@@ -97,6 +97,8 @@ def export_assets(
         record["faces"], record["levels"] = face_budgets[0], list(face_budgets[1:])
     if scene.surroundings:
         record["surroundings"] = scene.surroundings_ids
+    if scene.unit is not None:  # the exported scene has no `dual_path` that could say it
+        record["unit"] = scene.unit
     content = ExportContent(scene, inputs, shapes, ready, cut, extras, states, record, corrected, write, say)
     for exporter in exporters:
         exporter.write(content)

@@ -117,7 +117,7 @@ class Glb(Exporter):
         unit = self.settings.unit or content.scene.unit
         unit = None if unit == AS_IT_IS else unit
         extras = content.extras if unit is None else {**content.extras, "unit": "metre"}
-        meshes = _gltf_meshes(content, self.settings.pivot)
+        meshes = gltf_meshes(content, self.settings.pivot)
         content.write(self.leaves, glb_bytes(meshes, extras, None if unit is None else METRES[unit]))
 
 
@@ -189,7 +189,7 @@ def _earlier_files(content: ExportContent) -> dict[str, Path]:
     return {name: file for name, file in files.items() if name not in changed and file.suffix == ".ply"}
 
 
-def _gltf_meshes(content: ExportContent, pivot: bool = False) -> list[GltfMesh]:
+def gltf_meshes(content: ExportContent, pivot: bool = False) -> list[GltfMesh]:
     """The meshes.
 
     Args:

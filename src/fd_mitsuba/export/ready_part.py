@@ -99,7 +99,7 @@ def ready_part(
             write_atomically(folder / "textures" / f"{picture.name}.exr", exr(file.mi, getattr(textures, key)))
     material = replace(
         plain,
-        base_color=_factor(plain, fed),
+        base_color=colour_factor(plain, fed),
         base_picture=pictures["base_color"],
         orm_picture=pictures["orm"],
         normal_picture=pictures.get("normal"),
@@ -107,8 +107,12 @@ def ready_part(
     return ReadyPart(name, label, mesh, material, pictures, feeds, noise)
 
 
-def _factor(plain: PbrMaterial, fed: PartMaterial) -> tuple[float, float, float]:
-    """What the learned colour is to be multiplied with: a metal's own colour where it only tints that."""
+def colour_factor(plain: PbrMaterial, fed: PartMaterial) -> tuple[float, float, float]:
+    """What the learned colour is to be multiplied with: a metal's own colour where it only tints that.
+
+    Args:
+        plain: the part's BSDF as it is before anything is learned.
+    """
     if not fed.feeds.get("base_color", "").endswith("specular_reflectance"):
         return (1.0, 1.0, 1.0)
     tint = np.array(plain.base_color) / np.maximum(np.array(fed.start.base_color), 1e-3)

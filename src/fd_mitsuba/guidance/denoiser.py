@@ -13,6 +13,7 @@ from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
 from fd_mitsuba.guidance.model_conventions import FILE_NAME
+from fd_mitsuba.guidance.multiview import is_multiview
 from fd_mitsuba.guidance.side_by_side import cores_for_samples, of_samples
 from fd_mitsuba.guidance.variants import Chunk, Distillation, Query, passes_of
 
@@ -23,7 +24,7 @@ class Denoiser:
     A UNet with 8 input channels sees a condition's latents beside z_t, and may say only what must be added to them
     (`adds_to_base`); classifier-free guidance leaves the condition out of one pass (`has_image_pass`). One with 9 sees
     a mask of what to repaint and the masked picture's latents in every pass (`inpaints`). Both need the base's pictures
-    (`needs_base`).
+    (`needs_base`). One that is told cameras sees `views_together` consecutive pictures at once.
     """
 
     def __init__(self, components: Components, config: GuidanceConfig, device: str = "cpu") -> None:
@@ -33,6 +34,8 @@ class Denoiser:
         channels = components.unet.config.in_channels
         self.has_image_pass, self.inpaints = channels == 8, channels == 9
         self.needs_base = self.has_image_pass or self.inpaints
+        self.takes_cameras = is_multiview(dict(components.unet.config))
+        self.views_together = components.conventions.views_together or 1
         self.looks_at_picture = True
         self.adds_to_base = components.conventions.predicts == "difference"
         self.latent_size = latent_side(components.unet.config)
@@ -56,6 +59,7 @@ class Denoiser:
         texts: dict[str, Tensor],
         condition: Tensor | None,
         control: Tensor | None = None,
+        cameras: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Noise (N, 4, L, L), float32, of each pass that `texts` names, with at most `views_per_call` pictures at once.
 
@@ -65,7 +69,16 @@ class Denoiser:
             condition: the base's latents (N, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
                 For 9 channels (N, 5, L, L), the mask first; all passes see it.
             control: pictures (N, 3, H, H) in [0, 1] for the ControlNet, in all passes; None: it is not asked.
+            cameras: (N, 16), of `camera_conditions`, for a network that takes them.
+
+        Raises:
+            UserError: no cameras for a network that takes them.
         """
+        if self.takes_cameras and cameras is None:
+            raise UserError(
+                f"{self.components.folder}: a multi-view model, which must be told its cameras; it serves a run's "
+                "guidance only, so take a model that sees single views"
+            )
         passes, unet = len(texts), self.components.unet
         inputs, seen = z_t, []
         if condition is not None:
@@ -82,6 +95,8 @@ class Denoiser:
         if control is not None:
             columns["z_t"] = z_t.repeat(passes, 1, 1, 1).to(unet.dtype)
             columns["control"] = control.repeat(passes, 1, 1, 1).to(unet.dtype)
+        if cameras is not None:
+            columns["cameras"] = cameras.repeat(passes, 1).to(unet.dtype)
         if self.components.image_prompt is not None:
             columns["picture"] = self._pictures(tuple(texts), len(z_t)).to(unet.dtype)
         cores = cores_for_samples(unet, self.device)
@@ -89,7 +104,7 @@ class Denoiser:
         def call(*rows: Tensor) -> Tensor:
             return self._unet(dict(zip(columns, rows, strict=True)))
 
-        outputs = of_samples(call, tuple(columns.values()), self.config.views_per_call, cores)
+        outputs = of_samples(call, tuple(columns.values()), self.config.views_per_call, cores, self.views_together)
         if self.adds_to_base:
             outputs = outputs + torch.cat(seen)
         alpha_bar = self.alpha_bars[timesteps]
@@ -111,6 +126,8 @@ class Denoiser:
                 **known,
             )
             steered = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
+        if "cameras" in rows:
+            steered["class_labels"] = rows["cameras"]
         if "picture" in rows:
             steered["added_cond_kwargs"] = {"image_embeds": [rows["picture"]]}
         return self.components.unet(rows["inputs"], rows["times"], **known, **steered)[0].float()

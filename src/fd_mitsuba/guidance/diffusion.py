@@ -27,6 +27,7 @@ from fd_mitsuba.guidance.device import own_device, require_device
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
+from fd_mitsuba.guidance.multiview import camera_conditions
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
 from fd_mitsuba.guidance.picture_latents import PictureLatents
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
@@ -210,7 +211,13 @@ class DiffusionGuidance(Denoiser):
         areas = self._areas(views, self.passes(how))
         holes = self.conditions.holes(views) if self.inpaints else None
         control = self.conditions.control(views, self.control_sees)
-        rows_per_chunk = max(1, self.config.views_per_call // len(texts))
+        together = self.views_together
+        if count % together:
+            raise ValueError(f"{count} views do not fill groups of {together}; give a multiple of {together}")
+        cameras = None
+        if self.takes_cameras:
+            cameras = camera_conditions(views.azimuth_deg, views.elevation_deg).to(self.device)
+        rows_per_chunk = max(1, self.config.views_per_call // len(texts) // together) * together
         track = images.requires_grad and torch.is_grad_enabled()
 
         picture_gradients, latent_gradients, previews = [], [], []
@@ -230,6 +237,7 @@ class DiffusionGuidance(Denoiser):
                 mask=None if mask is None else mask[rows],
                 areas=tuple(area.rows(rows) for area in areas),
                 control=None if control is None else control[rows],
+                cameras=None if cameras is None else cameras[rows],
             )
             gradient, preview = self.latent_gradient(chunk, how)
             self._check_finite(gradient, chunk.timesteps, "latents")
@@ -325,7 +333,10 @@ class DiffusionGuidance(Denoiser):
         generator = step_generator(seed, step, phase)
         progress = min(step / max(steps_total - 1, 1), 1.0)
         bounds, levels = self._how(phase).timestep_range, len(self.alpha_bars)
-        timesteps = drawn_timesteps(self.config, bounds, levels, count, progress, generator)
+        # Views that are seen at once have one timestep, as in the training of such models.
+        groups = count // self.views_together
+        timesteps = drawn_timesteps(self.config, bounds, levels, groups, progress, generator)
+        timesteps = timesteps.repeat_interleave(self.views_together)
         noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
         return timesteps.to(self.device), noise.to(self.device)
 

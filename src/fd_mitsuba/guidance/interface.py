@@ -117,6 +117,8 @@ class Guidance(Protocol):
 
     Optional, for scenes whose focal regions have prompts: `set_part_prompts(prompts)` takes part -> (prompt, negative
     prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
+    Optional, for models that see several views at once: `views_together`, of which the number of views must be a
+    multiple. They are consecutive, share elevation and distance, and are evenly spread around the object.
 
     Properties here may be plain attributes of a class: nothing writes to them.
     """

@@ -10,8 +10,11 @@ import torch
 
 from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
+from fd_mitsuba.guidance.multiview import is_multiview
 
-LAYOUT = "only Stable Diffusion 1.x/2.x, inpainting and InstructPix2Pix layouts work (UNet, one CLIP text encoder)"
+LAYOUT = (
+    "only Stable Diffusion 1.x/2.x, inpainting, InstructPix2Pix and MVDream layouts work (UNet, one CLIP text encoder)"
+)
 WEIGHTS = {
     "unet": "diffusion_pytorch_model",
     "vae": "diffusion_pytorch_model",
@@ -20,7 +23,7 @@ WEIGHTS = {
 """Components with weights, and the name of their file without its ending."""
 TOKENIZER_FILES = (("tokenizer.json",), ("vocab.json", "merges.txt"))
 CLASSES = {
-    "unet": {"UNet2DConditionModel"},
+    "unet": {"UNet2DConditionModel", "MultiViewUNetModel"},
     "vae": {"AutoencoderKL", "AutoencoderTiny"},
     "text_encoder": {"CLIPTextModel"},
     "tokenizer": {"CLIPTokenizer", "CLIPTokenizerFast", "PreTrainedTokenizerFast"},
@@ -127,7 +130,7 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
             "distilled to jump to the end and tells no noise; take the model that it was made from"
         )
     for key in ("addition_embed_type", "class_embed_type", "encoder_hid_dim"):
-        if unet.get(key) is not None:
+        if unet.get(key) is not None and not (key == "class_embed_type" and is_multiview(unet)):
             raise UserError(f"{path}: {key} = {unet[key]!r} asks for a condition beside the text; {LAYOUT}")
     width, wanted = text.get("hidden_size", 512), unet.get("cross_attention_dim", 1280)
     if width != wanted:

@@ -31,6 +31,8 @@ from fd_mitsuba.guidance.learned_words import add_word
 from fd_mitsuba.guidance.lora import add_lora
 from fd_mitsuba.guidance.memory import BYTES, require_memory, working_set_bytes
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
+from fd_mitsuba.guidance.multiview import join_views
+from fd_mitsuba.guidance.multiview_layout import ORIGINAL_CLASS, converted_unet, multiview_conventions, unet_config
 from fd_mitsuba.io.hub import hub_snapshot, is_offline, local_folder
 
 HUB_FILES = ["model_index.json", FILE_NAME, "tokenizer/*", "scheduler/*.json"] + [
@@ -74,7 +76,9 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     folder = locate(config.model, appearance)
     index = read_layout(folder)
     configs = {part: read_json(folder / part / "config.json") for part in WEIGHTS}
-    conventions = read_model_conventions(folder)
+    original = configs["unet"].get("_class_name") == ORIGINAL_CLASS
+    configs["unet"] = unet_config(folder / "unet" / "config.json", configs["unet"])
+    conventions = multiview_conventions(folder, configs["unet"], read_model_conventions(folder), config)
     check_sizes(folder, configs, conventions)
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
@@ -93,12 +97,22 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     latent_size = latent_side(configs["unet"])
     require_memory(
         (counts["unet"] + control_weights) * size + counts["text_encoder"] * text_size + counts["vae"] * 4,
-        working_set_bytes(configs["unet"], configs["vae"], latent_size, config.views_per_call, config.dtype),
+        working_set_bytes(
+            configs["unet"],
+            configs["vae"],
+            latent_size,
+            config.views_per_call,
+            config.dtype,
+            conventions.views_together or 1,
+        ),
         device,
         str(folder),
     )
     variants = {part: variant for part, (_, variant) in files.items()}
-    loaded = _with_additions(_load(folder, index, variants, config, conventions, device), config)
+    unet = _converted(files["unet"][0], configs["unet"], config) if original else None
+    loaded = _with_additions(_load(folder, index, variants, config, conventions, device, unet), config)
+    if conventions.views_together is not None:
+        join_views(loaded.unet, conventions.views_together)
     if control is None:
         return loaded
     return replace(loaded, controlnet=_load_controlnet(control, control_variant, config, device))
@@ -117,14 +131,17 @@ def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     return replace(loaded, words=dict(words), image_prompt=picture)
 
 
-def locate(model: str, appearance: bool = False) -> Path:
+def locate(model: str, appearance: bool = False, setting: str = "guidance.model") -> Path:
     """The folder of a model name: `builtin`, an existing folder, or a snapshot of a hub id (fetched, unless offline).
 
     `HF_HUB_OFFLINE=1` keeps to what is in the hub's cache.
+
+    Args:
+        setting: what names the model, for messages.
     """
     if (shipped := shipped_folder(model, appearance)) is not None:
         return builtin_folder(shipped)
-    folder = local_folder(model, "guidance.model", "Stable-Diffusion layout")
+    folder = local_folder(model, setting, "Stable-Diffusion layout")
     return _snapshot(model) if folder is None else folder
 
 
@@ -149,6 +166,7 @@ def _load(
     config: GuidanceConfig,
     conventions: ModelConventions,
     device: str,
+    unet: torch.nn.Module | None = None,
 ) -> Components:
     with uncollected():  # what these name is imported when it is asked for
         import diffusers
@@ -172,7 +190,10 @@ def _load(
     for part, network_class, kind in wanted:
         owner: Any = network_class
         key = "torch_dtype" if part != "text_encoder" else "dtype"
-        model = _network(owner, folder / part, variants[part], **{key: kind})
+        if part == "unet" and unet is not None:
+            model = unet
+        else:
+            model = _network(owner, folder / part, variants[part], **{key: kind})
         loaded[part] = model.to("cpu" if part == "text_encoder" else device)
     with _one_line(folder / "tokenizer"), quiet_loading():
         # A tokenizer of the generic class keeps the rules in its own file; the CLIP class would impose CLIP's.
@@ -189,6 +210,11 @@ def _load(
     if not hasattr(scheduler, "alphas_cumprod"):
         raise UserError(f"{folder / 'scheduler'}: {index['scheduler'][1]} has no noise levels alphas_cumprod; {LAYOUT}")
     return Components(tokenizer, loaded["text_encoder"], loaded["unet"], loaded["vae"], scheduler, conventions, folder)
+
+
+def _converted(files: list[Path], unet: dict[str, Any], config: GuidanceConfig) -> torch.nn.Module:
+    with _one_line(files[0].parent), quiet_loading():
+        return converted_unet(files, unet, getattr(torch, config.dtype))
 
 
 def _load_controlnet(folder: Path, variant: str | None, config: GuidanceConfig, device: str) -> torch.nn.Module:

@@ -96,7 +96,9 @@ def _left_in_group(group: Path) -> int | None:
         return None
 
 
-def working_set_bytes(unet: dict[str, Any], vae: dict[str, Any], latent_size: int, batch: int, dtype: str) -> int:
+def working_set_bytes(
+    unet: dict[str, Any], vae: dict[str, Any], latent_size: int, batch: int, dtype: str, together: int = 1
+) -> int:
     """Rough bytes beside the weights: one UNet forward pass of `batch` pictures, and the VAE encoder's backward pass.
 
     Args:
@@ -104,6 +106,7 @@ def working_set_bytes(unet: dict[str, Any], vae: dict[str, Any], latent_size: in
         latent_size: side of the latents.
         batch: pictures in one call of the UNet. The encoder sees half of them, since guidance takes two passes or more.
         dtype: of the UNet; the VAE is float32.
+        together: pictures that are never parted, for the encoder neither.
     """
     widths = unet.get("block_out_channels", (320,))
     unet_bytes = UNET_TENSORS * widths[0] * latent_size**2 * BYTES[dtype]
@@ -115,7 +118,7 @@ def working_set_bytes(unet: dict[str, Any], vae: dict[str, Any], latent_size: in
         VAE_TENSORS * count * width * (side // 2**level) ** 2 * 4
         for level, (width, count) in enumerate(zip(widths, blocks, strict=False))
     )
-    return batch * unet_bytes + max(1, batch // 2) * vae_bytes
+    return batch * unet_bytes + max(together, batch // 2) * vae_bytes
 
 
 def require_memory(needed_weights: int, working_set: int, device: str, source: str) -> None:

@@ -23,6 +23,8 @@ class ModelConventions(BaseModel):
 
     view_grid: Annotated[int, Field(ge=1, le=4)] = 1
     """Pictures are mosaics of view_grid x view_grid views, row by row from the top left, azimuths evenly spread."""
+    views_together: Annotated[int, Field(ge=1, le=16)] | None = None
+    """Consecutive views that a multi-view model sees at once; 4 where nothing is said. Not for other models."""
     normal_space: NormalSpace | None = None
     """Frame of the normals in the training pictures; None: the weights do not care."""
     needs_base: bool | None = None

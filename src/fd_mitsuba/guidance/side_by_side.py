@@ -26,7 +26,9 @@ def cores_for_samples(network: nn.Module, device: torch.device) -> int:
     return torch.get_num_threads()
 
 
-def of_samples(call: Callable[..., Tensor], inputs: Sequence[Tensor], most: int, cores: int) -> Tensor:
+def of_samples(
+    call: Callable[..., Tensor], inputs: Sequence[Tensor], most: int, cores: int, together: int = 1
+) -> Tensor:
     """`call` of the rows of all inputs, joined: (N, ...).
 
     Args:
@@ -34,10 +36,11 @@ def of_samples(call: Callable[..., Tensor], inputs: Sequence[Tensor], most: int,
         inputs: tensors of N rows.
         most: rows at once, in all threads together.
         cores: threads that each work alone; 1: the caller's, with whatever torch gives it.
+        together: so many consecutive rows are never parted; divides N, and is at most `most`.
     """
-    count = len(inputs[0])
+    count, most = len(inputs[0]) // together, most // together
     workers = max(1, min(cores, count, most))
-    rows = min(most // workers, -(-count // workers))
+    rows = together * min(most // workers, -(-count // workers))
     pieces = list(zip(*(whole.split(rows) for whole in inputs), strict=True))
     if cores == 1:
         return torch.cat([call(*piece) for piece in pieces])

@@ -85,7 +85,8 @@ class Chunk:
     """What the network needs for some pictures: all (n, ...), on its device, without gradients.
 
     `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere. `areas` have texts of
-    their own: there the network's noise is what it sees with these. `control` (n, 3, H, H) is for a ControlNet.
+    their own: there the network's noise is what it sees with these. `control` (n, 3, H, H) is for a ControlNet,
+    `cameras` (n, 16) for a network that sees several views at once; its groups are consecutive and whole.
     """
 
     z: Tensor
@@ -96,6 +97,7 @@ class Chunk:
     mask: Tensor | None
     areas: tuple[Area, ...] = ()
     control: Tensor | None = None
+    cameras: Tensor | None = None
 
 
 class Network(Protocol):
@@ -114,6 +116,7 @@ class Network(Protocol):
         texts: dict[str, Tensor],
         condition: Tensor | None,
         control: Tensor | None = None,
+        cameras: Tensor | None = None,
     ) -> dict[str, Tensor]: ...
 
 
@@ -150,7 +153,7 @@ class Query:
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
         if missing := set(names) - set(texts):
             raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
-        known = self.chunk.condition, self.chunk.control
+        known = self.chunk.condition, self.chunk.control, self.chunk.cameras
         seen = self.network.predict_noise(z_t, timesteps, texts, *known)
         merged = dict(seen)
         for area in self.chunk.areas:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     surface = 4e-7 * 8.6 * vertices ** (2 / 3)
     builtin = is_builtin(guidance.model)
     cores = min(cores_in_use(), _MOST_CORES_OF_USE)
-    side = 32 if builtin else 64
+    side = latent_size(guidance.model)
     refined = 1 - geometry.coarse_fraction
     coarse_rays = 3e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
     refined_rays = 3e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
@@ -103,7 +104,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
         forward = encoder * (_FINER if guidance.model == BUILTIN_FINE else 1.0)
     else:
         # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
-        forward, encoder = 800.0 * weights / speed.unet, 2.2e12 / speed.vae
+        forward, encoder = (side / 64) ** 2 * 800.0 * weights / speed.unet, (side / 64) ** 2 * 2.2e12 / speed.vae
     rays = slower * ((1 - refined) * coarse_rays + refined * refined_rays)
     image = passes * forward + rays + refined * geometry.views * encoder
     step = slower * (0.03 + field + surface) + (image if geometry.lambda_sds > 0 else 0.0)
@@ -120,8 +121,8 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     # The run leaves the appearance stage out where its prior knows no faces of a cut.
     left_out = builtin and scene.subtracts and config.appearance.lambda_sds > 0
     stages = ("geometry",) if left_out else STAGES
-    shape_memory = sum(run_memory(size, config, ("geometry",), weights).values())
-    terms = run_memory(size, config, stages, weights)
+    shape_memory = sum(run_memory(size, config, ("geometry",), weights, side).values())
+    terms = run_memory(size, config, stages, weights, side)
     try:
         warning = memory_warning(scene, terms) or ""
     except UserError as error:
@@ -194,7 +195,7 @@ def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encode
     settings = config.appearance
     builtin = is_builtin(config.guidance.model)
     guided = settings.lambda_sds > 0
-    side = settings.picture_size or ((32 if builtin else 512) if guided else 128)
+    side = settings.picture_size or ((32 if builtin else 8 * latent_size(config.guidance.model)) if guided else 128)
     samples = settings.views * side**2 * settings.spp
     depth = settings.max_depth if settings.max_depth > 0 else 8
     light = slower * 1.3e-7 * samples * (1 + 0.5 * (depth - 2))
@@ -216,3 +217,14 @@ def unet_weights(model: str) -> tuple[float, str]:
     if is_builtin(model):
         return 7.0e6, "the built-in prior"
     return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"
+
+
+def latent_size(model: str) -> int:
+    """Side of the latents that a guidance model's UNet was made for; 64 where no local folder says another."""
+    if is_builtin(model):
+        return 32
+    try:
+        config = json.loads((Path(model) / "unet" / "config.json").read_text(encoding="utf-8"))
+        return int(config.get("sample_size") or config["image_size"])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return 64

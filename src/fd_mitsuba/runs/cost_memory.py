@@ -83,12 +83,15 @@ def check_memory_mb(size: SceneSize) -> float:
     return _IMPORTS + 20 + sum(_scene_terms(size, "check").values())
 
 
-def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet_weights: float) -> dict[str, float]:
+def run_memory(
+    size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet_weights: float, latent_size: int = 64
+) -> dict[str, float]:
     """Setting or input -> what it adds to the peak of a run, in units of 2^20 bytes; "any run" is the rest.
 
     Args:
         stages: `geometry`, `appearance` or both.
         unet_weights: parameters of the guidance model's UNet.
+        latent_size: side of its latents; plays no part for the built-in prior.
     """
     lit = "appearance" in stages
     terms = {"any run": _IMPORTS + _SHAPE + (_MATERIAL if lit else 0.0)}
@@ -99,11 +102,11 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet
     grid = (config.geometry.grid_resolution + 1) ** 3
     terms["geometry.grid_resolution"] = _PER_GRID_VERTEX * (grid - _USUAL_GRID) / _MIB
     terms["field.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.field) / _MIB
-    terms["guidance.model"] = _guidance(config, stages, unet_weights)
+    terms["guidance.model"] = _guidance(config, stages, unet_weights, latent_size)
     terms["output.turntable_size"] = _ring(config.output)
     if lit:
         settings, output = config.appearance, config.output
-        side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 512)
+        side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 8 * latent_size)
         step = settings.views * side**2 * settings.spp
         photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
         name = "output.picture_size" if photograph >= step else "appearance.spp"
@@ -175,7 +178,7 @@ def _ring(output: OutputConfig) -> float:
     return (_PER_RAY * portion + _PER_FRAME_PIXEL * (pixels - _USUAL_FRAME_PIXELS)) / _MIB
 
 
-def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float) -> float:
+def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float, latent_size: int) -> float:
     guidance = config.guidance
     wanted = [config.geometry.lambda_sds > 0] * ("geometry" in stages)
     wanted += [config.appearance.lambda_sds > 0] * ("appearance" in stages)
@@ -191,7 +194,7 @@ def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float) -> flo
         return (text + weights * size) / _MIB  # loaded here before it is moved
     # As `guidance.memory` demands: weights with the VAE, one call of the UNet, the encoder's maps for half of it.
     calls = 65e6 * size * guidance.views_per_call + 3300e6 * max(1, guidance.views_per_call // 2)
-    return (text + weights * size + 4 * 84e6 + calls) / _MIB
+    return (text + weights * size + 4 * 84e6 + (latent_size / 64) ** 2 * calls) / _MIB
 
 
 def _table_bytes(field: FieldConfig | TextureConfig) -> float:

@@ -35,7 +35,7 @@ from fd_mitsuba.runs.appearance_outcome import (
     write_appearance,
 )
 from fd_mitsuba.runs.choices import checked_choices
-from fd_mitsuba.runs.cost import unet_weights
+from fd_mitsuba.runs.cost import latent_size, unet_weights
 from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
 from fd_mitsuba.runs.follower import refuse_guidance_alone
 from fd_mitsuba.runs.geometry_outcome import (
@@ -133,7 +133,8 @@ def run(
         for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
             say(line)
         size, weights = SceneSize.of(scene), unet_weights(config.guidance.model)[0]
-        if warning := memory_warning(scene, run_memory(size, config, tuple(stages), weights)):
+        terms = run_memory(size, config, tuple(stages), weights, latent_size(config.guidance.model))
+        if warning := memory_warning(scene, terms):
             say(warning)
         # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
         for_geometry = prepare_geometry(scene, config, say, guidance) if with_geometry else None

@@ -22,6 +22,8 @@ from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 _MESHES = frozenset((*ANALYTIC, *FILE_SHAPES.values(), "cube"))
 _FLAT = 1e-4
 """Thickness over extent of a shape that only closes off a room."""
+_SLACK = 1e-3
+"""Of the extent of a box, how far beyond it something may reach and still be within."""
 _SAME_OBJECT = 0.5
 """Share of a shape's box within that of the shapes that regions touch, from which it belongs to the same object."""
 
@@ -49,7 +51,8 @@ def choose_base(
     """The shapes that the integrator's `base` names.
 
     Without it: all shapes, if each is a mesh that is not flat. A floor, a wall or a curve tells that the object is not
-    alone: then those that the regions touch, and what lies within their box, such as a pot's lid or an animal's eyes.
+    alone: then those that the regions touch, and what lies within their box, such as a pot's lid, a window's pane or an
+    animal's eyes.
 
     Args:
         regions_in: the focal regions in a frame that is given; None: there are none to go by.
@@ -75,7 +78,10 @@ def choose_base(
     if not solid:  # whatever is wrong with them is told as if they were all
         return _choice(shapes, {i: base_mesh(file, item) for i, item in enumerate(shapes)})
     chosen = solid if regions_in is None else _touched(solid, regions_in)
-    choice = _choice(shapes, chosen)
+    own = chosen | _enclosed({i: mesh for i, mesh in meshes.items() if i not in solid}, chosen)
+    choice = _choice(shapes, {i: own[i] for i in sorted(own)})
+    if not choice.surroundings:
+        return choice
     how = (
         f"edited: {_names(choice.base)}; surroundings: {_names(choice.surroundings)} "
         '(<string name="base" value="ids, separated by commas"/> in dual_path chooses others)'
@@ -114,6 +120,18 @@ def _touched(
     low, high = points.min(axis=0), points.max(axis=0)
     within = {i for i in solid if _share_within(vertices[i], low, high) >= _SAME_OBJECT}
     return {i: mesh for i, mesh in solid.items() if i in touched | within}
+
+
+def _enclosed(flat: Mapping[int, TriangleMesh], solid: Mapping[int, TriangleMesh]) -> dict[int, TriangleMesh]:
+    """The flat shapes that lie wholly within the box of solid ones: a pane or a label, but no floor."""
+    if not solid or not flat:
+        return {}
+    corners = np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh in solid.values()])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    slack = _SLACK * float((high - low).max())
+    used = {i: mesh.vertices[np.unique(mesh.faces)] for i, mesh in flat.items()}
+    within = {i for i, own in used.items() if (own >= low - slack).all() and (own <= high + slack).all()}
+    return {i: mesh for i, mesh in flat.items() if i in within}
 
 
 def _gap(region: FocalRegion, distance: MeshDistance, vertices: np.ndarray) -> float:

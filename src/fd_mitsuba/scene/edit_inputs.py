@@ -7,12 +7,10 @@ from pathlib import Path
 
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.part_stack import UNITS, read_stack
 from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.xml_guard import scan_scene, uses
-
-UNITS = ("mm", "cm", "m")
-"""That a scene can say."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +81,11 @@ class EditInputs:
         return any(item.plugin == DUAL_PATH for file in self.sources for item in file.top_level("integrator"))
 
     def unit(self) -> str | None:
-        """What a unit of the scene is, "mm", "cm" or "m"; None where its integrator does not say.
+        """What a unit of the scene is, "mm", "cm" or "m"; None where neither its integrator nor, for a scene that was
+        exported, `stack.json` beside it says it.
 
         Raises:
-            UserError: it says something else.
+            UserError: the integrator says something else; `stack.json` is damaged.
         """
         for element in self.scene.top_level("integrator"):
             unit = element.properties.get("unit") if element.plugin == DUAL_PATH else None
@@ -94,7 +93,7 @@ class EditInputs:
                 raise element.error(f"unit {unit!r} is not known; write one of {', '.join(UNITS)}")
             if unit:
                 return str(unit)
-        return None
+        return read_stack(self.scene.path.parent)[1].get("unit")
 
     def base_names(self) -> tuple[SceneElement, list[str]] | None:
         """The ids of the shapes to edit and the integrator that names them; None where none does.

@@ -233,7 +233,7 @@ def load_edit_scene(
     for source in inputs.sources:
         refuse_broken_parameters(source, source.instantiate())
     folder = file.path.parent
-    record = [folder / RECORD_NAME, *(part.normal_path(folder) for part in earlier)] if earlier else []
+    record = [folder / RECORD_NAME, *(part.normal_path(folder) for part in earlier)]
     return EditScene(
         path=file.path,
         inputs=inputs,

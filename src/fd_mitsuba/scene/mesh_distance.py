@@ -1,4 +1,4 @@
-"""Distances and winding numbers of a triangle soup: the only place that calls libigl.
+"""Distances and winding numbers of a triangle soup: the only place that asks libigl for them.
 
 `igl.signed_distance` is not used. With the fast winding number it scales the distance by `1 - 2 w` instead of taking
 that number's sign, which is off by 0.2 % on a closed sphere and arbitrarily wrong on an open mesh. Distance and

@@ -18,6 +18,8 @@ from fd_mitsuba.io.json_object import json_fault
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 
 RECORD_NAME = "stack.json"
+UNITS = ("mm", "cm", "m")
+"""That a scene can say."""
 SHOWN, HIDDEN, REMOVED = "shown", "hidden", "removed"
 
 _PREFIX = "part_"
@@ -125,6 +127,8 @@ def _export_settings(values: dict[str, Any]) -> dict[str, Any]:
     levels = values.get("levels", [])
     if not isinstance(levels, list) or any(type(level) is not int for level in levels):
         raise ValueError("levels are no numbers")
+    if values.get("unit") not in (None, *UNITS):
+        raise ValueError("an unknown unit")
     return dict(values)
 
 

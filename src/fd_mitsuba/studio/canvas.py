@@ -1,4 +1,4 @@
-"""The 3D side of the page: base, regions with their gizmo, the growing part, the result. All in the canonical frame.
+"""The 3D side of the page: base and part, the regions with their gizmo, the light. All in the canonical frame.
 
 In that frame every base is about two units long, so that gizmo, camera and grid need no scale of their own.
 """
@@ -13,8 +13,8 @@ import numpy as np
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.scene.focal_region import FocalRegion
 from fd_mitsuba.scene.normalisation import Normalisation
-from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
+from fd_mitsuba.studio.shown_objects import ShownObjects
 
 if TYPE_CHECKING:
     import viser
@@ -22,8 +22,18 @@ if TYPE_CHECKING:
 CAMERA, FOV_DEG = (2.3, 1.6, 3.75), 40.0
 """Where a tab looks from at first, towards the origin: it sees the whole cube."""
 GIZMO_SCALE = 0.42
+OWN_LIGHT = "the scene's"
+LIGHTS: dict[str, Any] = {
+    OWN_LIGHT: None,
+    "city": "city",
+    "photo studio": "studio",
+    "hall": "lobby",
+    "forest": "forest",
+    "sunset": "sunset",
+    "night": "night",
+}
+"""What the page calls an environment map -> its name among those of viser."""
 _COLOURS = [(242, 142, 43), (78, 121, 167), (89, 161, 79), (176, 122, 161), (225, 87, 89), (118, 183, 178)]
-_PART = (226, 178, 66)
 _LINES = (60, 60, 60)
 _GLASS, _FAINT_GLASS = 0.35, 0.1
 """Opacity of a region, and of one whose part is shown."""
@@ -37,6 +47,10 @@ class Canvas:
         on_region: hears the name of a region that was clicked.
         on_gizmo: hears the gizmo's position and quaternion while it is dragged, canonical frame.
         on_base: hears origin and direction of a click on the base while `picking`.
+
+    Attributes:
+        objects: base, part, and a result beside them.
+        visible: what is to be seen; call `apply_visibility` after a change.
     """
 
     def __init__(
@@ -52,14 +66,8 @@ class Canvas:
         self._clickable: set[str] = set()
         self._meshes: set[str] = set()
         self._gizmo: Any = None
-        self._base: Any = None
-        self._part: Any = None
-        self._beside: Any = None
-        self._wires: dict[str, tuple[np.ndarray, np.ndarray, Any]] = {}
-        """`base` and `part` -> vertices, faces, and the lines once somebody wanted to see them."""
-        self.base_hidden = False
-        """Whether the part's GLB has the base in it."""
         self.visible = {"base": True, "part": True, "regions": True, "wireframe": False, "grid": True}
+        self.objects = ShownObjects(server, self.visible)
         self._scene.set_up_direction("+y")
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = CAMERA, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -74,20 +82,27 @@ class Canvas:
             "/grid", box, _LINES, thickness=1.0, thickness_units="screen", visible=self.visible["grid"]
         )
 
-    def show_base(self, glb: bytes, frame: Normalisation, soup: TriangleMesh) -> None:
-        """The base, from a GLB in the user frame; `soup` is the same in the canonical frame, for its wires."""
-        with self.server.atomic():
-            self._base = self._glb("/base", glb, frame)
-            self._set_wires("base", soup.vertices, soup.faces)
-            self.apply_visibility()
-
     def picking(self, wanted: bool) -> None:
         """Whether a click on the base is heard."""
-        if self._base is None:
-            return
-        self._base.remove_click_callback("all")
-        if wanted:
-            self._base.on_click(lambda event: self._on_base(event))
+        self.objects.picking(self._on_base if wanted else None)
+
+    def set_light(self, name: str, own: bytes | None) -> None:
+        """One of `LIGHTS` instead of the one before, for every tab.
+
+        Args:
+            own: the scene's, as a JPEG with a gain map; None: it has none to show, and the page's own stands in.
+        """
+        from viser._messages import EnvironmentMapMessage
+
+        alone = name == OWN_LIGHT and own is not None
+        with self.server.atomic():
+            self._scene.configure_default_lights(not alone)  # viser's two lamps
+            if alone:
+                nowhere, upright = (0.0, 1.0), (1.0, 0.0, 0.0, 0.0)
+                message = EnvironmentMapMessage(own, False, *nowhere, upright, 1.0, upright)
+                self._scene._websock_interface.queue_message(message)  # takes presets alone otherwise
+            else:
+                self._scene.configure_environment_map(LIGHTS[name] or "city")
 
     def show_regions(self, poses: Sequence[EllipsoidPose], meshes: Sequence[FocalRegion], frame: Normalisation) -> None:
         """All regions as glass; the gizmo stays as it is."""
@@ -158,75 +173,19 @@ class Canvas:
                 handle.remove_click_callback("all")
                 self._clickable.remove(name)
 
-    def show_part_mesh(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """The part in clay: vertices (V, 3) canonical, faces (F, 3)."""
-        with self.server.atomic():
-            self._part = self._scene.add_mesh_simple("/part", vertices, faces, color=_PART, side="double")
-            self._set_wires("part", vertices, faces)
-            self.apply_visibility()
-
-    def show_part_glb(self, glb: bytes, frame: Normalisation, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """The part with its material, from a GLB in the user frame; its mesh again, canonical, for its wires."""
-        with self.server.atomic():
-            self._part = self._glb("/part", glb, frame)
-            self._set_wires("part", vertices, faces)
-            self.apply_visibility()
-
-    def show_beside(self, glb: bytes | None, frame: Normalisation, aside: float = 0.0) -> None:
-        """Another result, base and part, beside the first; None: none.
-
-        Args:
-            glb: in the user frame.
-            aside: how far to the right, canonical units.
-        """
-        with self.server.atomic():
-            if self._beside is not None:
-                self._beside.remove()
-                self._beside = None
-            if glb is not None:
-                place = -frame.scale * frame.centre + np.array([aside, 0.0, 0.0])
-                self._beside = self._scene.add_glb("/beside", glb, scale=frame.scale, position=place)
-
-    def show_no_part(self) -> None:
-        """Nothing but the base."""
-        if self._part is not None:
-            self._part.remove()
-            self._part = None
-        self._set_wires("part", np.zeros((0, 3)), np.zeros((0, 3)))
-
     @property
     def _glass(self) -> float:
-        return _GLASS if self._part is None else _FAINT_GLASS
+        return _FAINT_GLASS if self.objects.has_part else _GLASS
 
     def apply_visibility(self) -> None:
         """Show what `visible` says; regions are faint where a part is to be seen in them."""
         shown = self.visible
         self._grid.visible = shown["grid"]
-        solid = {"base": shown["base"] and not self.base_hidden, "part": shown["part"]}
-        for name, handle in (("base", self._base), ("part", self._part)):
-            if handle is not None:
-                handle.visible = solid[name]
-        for name, (vertices, faces, lines) in list(self._wires.items()):
-            wanted = solid[name] and shown["wireframe"]
-            if wanted and lines is None and len(faces):
-                lines = self._scene.add_mesh_simple(f"/{name}_wires", vertices, faces, color=_LINES, wireframe=True)
-                self._wires[name] = vertices, faces, lines
-            if lines is not None:
-                lines.visible = wanted
+        self.objects.apply()
         for handle in self._regions.values():
             handle.visible, handle.opacity = shown["regions"], self._glass
         if self._gizmo is not None:
             self._gizmo.visible = shown["regions"]
-
-    def _glb(self, name: str, glb: bytes, frame: Normalisation) -> Any:
-        return self._scene.add_glb(name, glb, scale=frame.scale, position=-frame.scale * frame.centre)
-
-    def _set_wires(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """Lines of another mesh, which are only sent when they are wanted."""
-        before = self._wires.get(name)
-        if before is not None and before[2] is not None:
-            before[2].remove()
-        self._wires[name] = vertices, faces, None
 
 
 def region_colour(number: int) -> tuple[int, int, int]:

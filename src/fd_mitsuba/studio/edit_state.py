@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.opening import Opened
 from fd_mitsuba.studio.region_list import RegionList
 from fd_mitsuba.studio.run_state import RunState
+from fd_mitsuba.studio.scene_light import scene_light
 from fd_mitsuba.studio.scene_patch import patched
 from fd_mitsuba.studio.scene_source import SceneSource
 from fd_mitsuba.studio.settings import StudioSettings
@@ -30,6 +32,7 @@ class EditState:
     source: where the scene is.
     scene: as its file has it; regions and prompt are those of this object.
     glb: the base as the page shows it, user frame.
+    light: the scene's, as the page shows it; None: it has none that comes from all around.
     regions, prompt, settings: as they are now; a prompt may be blank.
     selected: name of the ellipsoid that gizmo and fields are for, "" for none.
     saved: the ellipsoids as the scene's file has them.
@@ -38,6 +41,7 @@ class EditState:
     source: SceneSource
     scene: EditScene
     glb: bytes
+    light: bytes | None
     regions: RegionList
     prompt: str
     settings: StudioSettings
@@ -63,7 +67,8 @@ class EditState:
         scene = source.load(prompt)
         regions = RegionList.of_scene(scene)
         saved, first = list(regions.poses.values()), next(iter(regions.poses), "")
-        return cls(source, scene, base_glb(scene), regions, scene.prompt, settings, first, saved)
+        shown = base_glb(scene), scene_light(scene)
+        return cls(source, scene, *shown, regions, scene.prompt, settings, first, saved)
 
     def edited_scene(self) -> EditScene:
         """The scene with the regions and the prompt as they are now, in the frame that a run would have."""
@@ -120,6 +125,11 @@ class EditState:
             raise UserError(f"run {run.name}: has no result yet; let it finish first")
         regions, prompt = list(self.regions.poses.values()), self.prompt or run.prompt
         return self._of_source(self.source.next_round(run.folder, regions, prompt, run.prompt), None, self.settings)
+
+    def of_mesh(self, path: Path) -> tuple[EditState, list[str]]:
+        """The state with a mesh file as its base, imported, and what is to be said about it; UserError as `import`."""
+        source, said = self.source.of_mesh(path)
+        return self._of_source(source, None, self.settings), said
 
     def write(self, adopted: list[str]) -> None:
         """Replace the work folder's record; `adopted` are run folders from elsewhere."""

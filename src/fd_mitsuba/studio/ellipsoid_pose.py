@@ -26,6 +26,7 @@ class EllipsoidPose:
         radii: half lengths along its own axes, user units, positive.
         part: the editable part that it belongs to.
         mode: as of a `FocalRegion`.
+        prompt, negative_prompt: of its part, as of a `PartPrompt`; "": the part has none, or another region says it.
 
     Example:
         EllipsoidPose("hat", (0, 1.2, 0), (1, 0, 0, 0), (0.3, 0.4, 0.3)).mirrored("hat_2", axis=0, middle=0.5)
@@ -37,6 +38,8 @@ class EllipsoidPose:
     radii: Vector
     part: str = DEFAULT_PART_NAME
     mode: str = ADD
+    prompt: str = ""
+    negative_prompt: str = ""
 
     @classmethod
     def of_matrix(cls, name: str, matrix: np.ndarray, part: str = DEFAULT_PART_NAME, mode: str = ADD) -> EllipsoidPose:
@@ -54,7 +57,9 @@ class EllipsoidPose:
     def of_json(cls, row: dict[str, Any]) -> EllipsoidPose:
         """From `to_json`; KeyError, TypeError or ValueError where it is none."""
         place = vector(row["centre"]), _unit(row["wxyz"]), vector(row["radii"])
-        pose = cls(str(row["name"]), *place, str(row["part"]), SUBTRACT if row["mode"] == SUBTRACT else ADD)
+        mode = SUBTRACT if row["mode"] == SUBTRACT else ADD
+        words = str(row.get("prompt", "")), str(row.get("negative_prompt", ""))
+        pose = cls(str(row["name"]), *place, str(row["part"]), mode, *words)
         if min(pose.radii) <= 0:
             raise ValueError("a radius is not positive")
         return pose

@@ -3,10 +3,11 @@
     RUN/live/job.json       what is to be done; written by the studio
     RUN/live/events.jsonl   what the run has done: one JSON object a line, appended
     RUN/live/part.ply       the growing part as it was at the newest `mesh` event, user frame; replaced as a whole
+    RUN/live/part.glb       the part with its material as it was at the newest `material` event, likewise
     RUN/live/log.txt        what the process printed
 
 Events: `begun`, `said` (a line for people), `step` (stage, phase, step, total, losses), `mesh` (step, faces),
-`finished`, `stopped` and `failed` (with the line to show).
+`material` (step), `finished`, `stopped` and `failed` (with the line to show).
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import parse_json_object, read_json_object, write_json
 from fd_mitsuba.runs.run_folder import LIVE_FOLDER
 
-MESH_NAME = "part.ply"
-MESH_EVERY = 10
-"""Steps between two meshes; the first comes after the first step."""
+MESH_NAME, MATERIAL_NAME = "part.ply", "part.glb"
+SHOW_EVERY = 10
+"""Steps between two meshes or materials; the first comes after the first step."""
 
 
 @dataclass(frozen=True)

@@ -18,3 +18,8 @@ def without_paths(text: str, *folders: Path) -> str:
     for spelling in sorted(spellings, key=len, reverse=True):
         text = text.replace(f"{spelling}/", "")
     return _FOLDERS.sub("", text)
+
+
+def escaped(text: str) -> str:
+    """Text as Markdown that shows it and nothing else."""
+    return "".join(f"\\{letter}" if letter in "\\`*_{}[]()<>#+!|" else letter for letter in text)

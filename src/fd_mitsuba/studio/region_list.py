@@ -21,6 +21,8 @@ NEW_RADIUS = 0.22
 _SUNK = 0.25
 """How deep a new region reaches into the base, in radii."""
 _MOST_REGIONS = 32
+LONGEST_PROMPT = 1000
+"""In letters."""
 
 
 @dataclass
@@ -30,14 +32,12 @@ class RegionList:
     poses: the ellipsoids by name, in the scene's order.
     meshes: regions that are no ellipsoids: shown, kept, and not to be changed here.
     taken: names of parts of earlier rounds.
-    prompts: of regions that have one of their own.
     """
 
     frame: Normalisation
     poses: dict[str, EllipsoidPose] = field(default_factory=dict)
     meshes: dict[str, FocalRegion] = field(default_factory=dict)
     taken: tuple[str, ...] = ()
-    prompts: dict[str, PartPrompt] = field(default_factory=dict)
 
     @classmethod
     def of_scene(cls, scene: EditScene) -> RegionList:
@@ -47,11 +47,10 @@ class RegionList:
         found = cls(Normalisation.of_points(soup.vertices[np.unique(soup.faces)]), taken=taken)
         back = np.linalg.inv(scene.frame.matrix())
         for region in scene.regions:
-            if region.prompt is not None:
-                found.prompts[region.name] = region.prompt
             if region.is_ellipsoid:
                 matrix = back @ region.to_canonical
-                found.poses[region.name] = EllipsoidPose.of_matrix(region.name, matrix, region.part, region.mode)
+                pose = EllipsoidPose.of_matrix(region.name, matrix, region.part, region.mode)
+                found.poses[region.name] = pose if region.prompt is None else replace(pose, **vars(region.prompt))
             else:
                 found.meshes[region.name] = region.seen_from(found.frame.matrix() @ back)
         return found
@@ -63,9 +62,11 @@ class RegionList:
 
     def focal_regions(self) -> tuple[FocalRegion, ...]:
         """As `EditScene` has them, in `frame`."""
-        matrix, own = self.frame.matrix(), self.prompts
-        poses = self.poses.values()
-        ellipsoids = [FocalRegion(p.name, matrix @ p.matrix, p.part, None, p.mode, own.get(p.name)) for p in poses]
+        matrix = self.frame.matrix()
+        ellipsoids = []
+        for pose in self.poses.values():
+            own = PartPrompt(pose.prompt, pose.negative_prompt) if pose.prompt else None
+            ellipsoids.append(FocalRegion(pose.name, matrix @ pose.matrix, pose.part, None, pose.mode, own))
         return (*ellipsoids, *self.meshes.values())
 
     def pose(self, name: str) -> EllipsoidPose:
@@ -77,12 +78,13 @@ class RegionList:
         return self.poses[name]
 
     def put(self, pose: EllipsoidPose) -> None:
-        """Replace the ellipsoid of the same name.
+        """Replace the ellipsoid of the same name; a prompt is that of its part, so the part's other regions follow.
 
         Raises:
-            UserError: no such ellipsoid, a radius that is not positive, a part that cannot be called so.
+            UserError: no such ellipsoid, a radius that is not positive, a part that cannot be called so, a prompt that
+                is far too long, or that contradicts a mesh of the same part.
         """
-        self.pose(pose.name)
+        before = self.pose(pose.name)
         if min(pose.radii) <= 0:
             raise UserError(f"region {pose.name}: a radius is not positive; enlarge it")
         if not is_part_name(pose.part) or pose.part.lower() in {name.lower() for name in self.taken}:
@@ -90,7 +92,33 @@ class RegionList:
                 f"part {pose.part!r}: is taken by an earlier round, or cannot name a file; use letters, digits, "
                 "'_' and '-', and not 'base'"
             )
+        self._share_prompt(pose, before)
+
+    def _share_prompt(self, pose: EllipsoidPose, before: EllipsoidPose) -> None:
+        """Put a region, with the prompt that its part has: the one that was just typed, else that of the others."""
+        if len(pose.prompt) > LONGEST_PROMPT:
+            count = len(pose.prompt)
+            raise UserError(f"region {pose.name}: its prompt has {count} letters, more than {LONGEST_PROMPT}")
+        others = [other for other in self.poses.values() if other.part == pose.part and other.name != pose.name]
+        theirs = next((other for other in others if other.prompt), None)
+        if pose.part != before.part and pose.prompt == before.prompt and theirs is not None:
+            pose = replace(pose, prompt=theirs.prompt, negative_prompt=theirs.negative_prompt)
+        if not pose.prompt:
+            pose = replace(pose, negative_prompt="")
+        mine = PartPrompt(pose.prompt, pose.negative_prompt)
+        for mesh in self.meshes.values():
+            if pose.prompt and mesh.part == pose.part and mesh.prompt not in (None, mine):
+                raise UserError(
+                    f"region {pose.name}: {mesh.name}, a mesh of the same part, has the prompt "
+                    f"{mesh.prompt.prompt!r}; give the region another part"
+                )
         self.poses[pose.name] = pose
+        if pose.prompt != before.prompt or pose.part != before.part:
+            for other in others:
+                if other.prompt:
+                    self.poses[other.name] = replace(
+                        other, prompt=pose.prompt, negative_prompt=pose.negative_prompt
+                    )  # fmt: skip
 
     def add(self, point: np.ndarray, normal: np.ndarray) -> EllipsoidPose:
         """A new ball that reaches a little into the base at a point (3,) of its surface, canonical frame.
@@ -115,9 +143,13 @@ class RegionList:
         return self.add(hit.point, hit.normal)
 
     def remove(self, name: str) -> None:
-        """Take an ellipsoid away; UserError for a mesh."""
-        self.pose(name)
+        """Take an ellipsoid away; its part keeps its prompt. UserError for a mesh."""
+        gone = self.pose(name)
         del self.poses[name]
+        left = [pose for pose in self.poses.values() if pose.part == gone.part]
+        if left and not any(pose.prompt for pose in left):
+            words = {"prompt": gone.prompt, "negative_prompt": gone.negative_prompt}
+            self.poses[left[0].name] = replace(left[0], **words)
 
     def mirror(self, name: str, axis: int) -> EllipsoidPose:
         """A copy on the other side of the base's middle, of the same part.

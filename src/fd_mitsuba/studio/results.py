@@ -44,12 +44,13 @@ def shown_key(run: RunState) -> str:
     if run.state == FINISHED and (run.folder / "export" / "asset.glb").is_file():
         return f"{run.name} finished"
     if run.stage == "appearance" and _part_names(run.folder):
-        return f"{run.name} shape"
+        return f"{run.name} material {run.material_step if run.live_material.is_file() else 0}"
     return f"{run.name} live {run.mesh_step}" if run.mesh_step and run.live_mesh.is_file() else ""
 
 
 def shown_part(run: RunState, frame: Normalisation) -> ShownPart | None:
-    """The newest that there is of a run's part: with its material, as final shape, or as it grows; None: nothing yet.
+    """The newest that there is of a run's part: as it grows, then with the material learned so far, then as exported;
+    None: nothing yet.
 
     Args:
         frame: of the base that it is shown with.
@@ -67,7 +68,8 @@ def shown_part(run: RunState, frame: Normalisation) -> ShownPart | None:
     vertices = frame.to_canonical(np.concatenate([vertices for vertices, _ in meshes]))
     faces = np.concatenate([faces + start for (_, faces), start in zip(meshes, starts, strict=False)])
     if not key.endswith(" finished"):
-        return ShownPart(key, vertices, faces)
+        learned = " material " in key and not key.endswith(" 0")
+        return ShownPart(key, vertices, faces, _read(run.live_material) if learned else None)
     asset = (run.folder / "export" / "asset.glb").read_bytes()
     cut = any((run.folder / "export").glob("cut_face_*.ply"))
     return ShownPart(key, vertices, faces, asset if cut else only_parts(asset, names), cut)

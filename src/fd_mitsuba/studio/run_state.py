@@ -8,7 +8,7 @@ from typing import Any
 
 from fd_mitsuba.io.json_object import read_json_object
 from fd_mitsuba.runs.run_folder import LIVE_FOLDER
-from fd_mitsuba.studio.job import MESH_NAME, EventReader
+from fd_mitsuba.studio.job import MATERIAL_NAME, MESH_NAME, EventReader
 from fd_mitsuba.training.record import read_metrics
 
 QUEUED, STARTING, RUNNING, STOPPING, STOPPED, FINISHED, FAILED = (
@@ -27,7 +27,7 @@ class RunState:
         state: one of the constants of this module.
         stage, phase, step, total: where it is; step 0 before the first.
         losses: of the newest step.
-        mesh_step: step of the newest live mesh, 0 before the first.
+        mesh_step, material_step: step of the newest live mesh, and of the newest material, 0 before the first.
         line: the last thing to show a person: a remark, or why it failed.
         seed, prompt: what makes it this run.
         history: rows (stage, step, loss of the guidance) for a chart.
@@ -43,6 +43,7 @@ class RunState:
     total: int = 0
     losses: dict[str, float] = field(default_factory=dict)
     mesh_step: int = 0
+    material_step: int = 0
     line: str = ""
     history: list[tuple[str, int, float]] = field(default_factory=list)
 
@@ -57,6 +58,11 @@ class RunState:
     def live_mesh(self) -> Path:
         """The growing part, user frame."""
         return self.folder / LIVE_FOLDER / MESH_NAME
+
+    @property
+    def live_material(self) -> Path:
+        """The part with the material learned so far, user frame."""
+        return self.folder / LIVE_FOLDER / MATERIAL_NAME
 
     @property
     def finished_on_disk(self) -> bool:
@@ -102,6 +108,8 @@ class RunState:
                 self.history.append((self.stage, self.step, self.losses["loss_sds"]))
         elif event == "mesh":
             self.mesh_step = int(row.get("step") or 0)
+        elif event == "material":
+            self.material_step = int(row.get("step") or 0)
         elif event == "said":
             self.line = str(row.get("line", ""))
         elif event in ("stopped", "failed"):

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from fd_mitsuba.errors import Interrupted, UserError, out_of_memory
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.studio.job import MESH_EVERY, MESH_NAME, EventWriter, RunOrder
+from fd_mitsuba.runs.run_folder import LIVE_FOLDER
+from fd_mitsuba.studio.job import MATERIAL_NAME, MESH_NAME, SHOW_EVERY, EventWriter, RunOrder
 
 if TYPE_CHECKING:
     from fd_mitsuba.training.stage import StepUpdate
@@ -62,15 +63,19 @@ def _edit(order: RunOrder, folder: Path, events: EventWriter) -> None:
         variant=order.variant,
         plugins=config.plugins,
     )
-    started_by, asked = os.getppid(), list[bool]()
+    started_by, asked, material = os.getppid(), list[bool](), _Material()
 
     def on_step(update: StepUpdate) -> None:
         losses = {key: _short(value) for key, value in update.values.items() if key.startswith(("loss", "volume"))}
         events.write(
             "step", stage=update.stage, phase=update.phase, step=update.step, total=update.total, losses=losses
         )
-        if update.stage == "geometry" and (update.step % MESH_EVERY == 0 or update.step in (1, update.total)):
-            events.write("mesh", step=update.step, faces=_write_mesh(update.live, folder))
+        if update.step % SHOW_EVERY == 0 or update.step in (1, update.total):
+            if update.stage == "geometry":
+                events.write("mesh", step=update.step, faces=_write_mesh(update.live, folder))
+            else:
+                material.write(update.live, folder)
+                events.write("material", step=update.step)
         if os.getppid() != started_by and not asked:
             asked.append(True)  # once: a second signal would end the process before it has said so
             os.kill(os.getpid(), signal.SIGTERM)
@@ -87,9 +92,22 @@ def _edit(order: RunOrder, folder: Path, events: EventWriter) -> None:
     )
 
 
+class _Material:
+    """Writes what the appearance stage has learned so far."""
+
+    def __init__(self) -> None:
+        self._live: Any = None
+
+    def write(self, stage: Any, folder: Path) -> None:
+        from fd_mitsuba.studio.live_material import LiveMaterial
+
+        if self._live is None:
+            self._live = LiveMaterial(stage)
+        write_atomically(folder / LIVE_FOLDER / MATERIAL_NAME, self._live.glb())
+
+
 def _write_mesh(stage: Any, folder: Path) -> int:
     from fd_mitsuba.io.ply import ply_bytes
-    from fd_mitsuba.runs.run_folder import LIVE_FOLDER
     from fd_mitsuba.studio.live_part import live_part
 
     vertices, faces = live_part(stage)

@@ -100,21 +100,32 @@ def _changed(data: bytes, span: Span, pose: EllipsoidPose, before: EllipsoidPose
             edits.append((span.head, span.head, f"\n{inner}".encode() + text))
         else:
             edits.append((place.start, place.end, text))
-    if before is None or pose.part != before.part:
-        element = f'<string name="part" value={quoteattr(pose.part)}/>'.encode()
-        old = span.child("string", "part")
-        if old is not None:
+    known = {} if before is None else dict(_texts(before))
+    for name, text in _texts(pose):
+        if before is not None and known[name] == text:
+            continue
+        old = span.child("string", name)
+        element = f'<string name="{name}" value={_attribute(text)}/>'.encode()
+        if old is not None and text:
             edits.append((old.start, old.end, element))
-        elif pose.part != DEFAULT_PART_NAME:
+        elif old is not None:
+            edits.append((*line_of(data, old), b""))
+        elif text and (name, text) != ("part", DEFAULT_PART_NAME):
             edits.append((span.head, span.head, f"\n{indent}  ".encode() + element))
     return edits
+
+
+def _texts(pose: EllipsoidPose) -> list[tuple[str, str]]:
+    """Name and value of the texts of a region that can be changed; blank: not written."""
+    return [("part", pose.part), ("prompt", pose.prompt), ("negative_prompt", pose.negative_prompt)]
 
 
 def _shape(pose: EllipsoidPose, indent: str, attributes: dict[str, str] | None = None) -> bytes:
     named = {"type": FOCAL_REGION, "id": pose.name, **(attributes or {})}
     lines = ["<shape " + " ".join(f"{key}={quoteattr(value)}" for key, value in named.items()) + ">"]
-    if pose.part != DEFAULT_PART_NAME:
-        lines.append(f'  <string name="part" value={quoteattr(pose.part)}/>')
+    for name, text in _texts(pose):
+        if text and (name, text) != ("part", DEFAULT_PART_NAME):
+            lines.append(f'  <string name="{name}" value={_attribute(text)}/>')
     if pose.mode != ADD:
         lines.append(f'  <string name="mode" value={quoteattr(pose.mode)}/>')
     lines += [f"  {line}" for line in transform_lines(pose)] + ["</shape>"]

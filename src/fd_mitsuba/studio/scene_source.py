@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from fd_mitsuba.api import import_asset
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
@@ -116,15 +117,28 @@ class SceneSource:
         """The exported result of a run as the scene of another round.
 
         Args:
-            regions: to start from; their part gets the first free name.
+            regions: to start from; their part gets the first free name, and reads the scene's prompt.
             base_prompt: what the result looks like.
         """
-        number = self.round + 1
-        while self.work.scene_folder(number).exists():
-            number += 1
+        number = self.work.next_scene(self.round)
         folder = self.work.scene_folder(number)
         shutil.copytree(run / "export" / "mitsuba", folder)
         path = folder / "scene.xml"
-        plain = [replace(pose, part=DEFAULT_PART_NAME) for pose in regions]
+        plain = [replace(pose, part=DEFAULT_PART_NAME, prompt="", negative_prompt="") for pose in regions]
         write_atomically(path, patched(path.read_bytes(), path.name, plain, [], (), prompt, base_prompt))
         return SceneSource(self.work, path, path, self.first, {}, number)
+
+    def of_mesh(self, path: Path) -> tuple[SceneSource, list[str]]:
+        """A mesh file as the scene of another round, and what was guessed and left out, a line each.
+
+        Raises:
+            UserError: it cannot be read or edited.
+        """
+        number = self.work.next_scene(self.round)
+        folder = self.work.scene_folder(number)
+        try:
+            made = import_asset(path, folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return SceneSource(self.work, made.scene, made.scene, self.first, {}, number), [*made.remarks, *made.notes]

@@ -64,6 +64,7 @@ class StudioServer:
 
     def close(self) -> None:
         """End the page; the session is the caller's."""
+        self.view.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 

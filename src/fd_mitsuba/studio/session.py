@@ -31,11 +31,10 @@ from fd_mitsuba.studio.opening import Opened
 from fd_mitsuba.studio.picking import first_hit
 from fd_mitsuba.studio.plain_text import without_paths
 from fd_mitsuba.studio.queue import PROGRAM, RunQueue
-from fd_mitsuba.studio.region_list import RegionList
+from fd_mitsuba.studio.region_list import LONGEST_PROMPT, RegionList
 from fd_mitsuba.studio.run_state import FINISHED
 from fd_mitsuba.studio.settings import StudioSettings
 
-_LONGEST_PROMPT = 1000
 Listener = Callable[[str], None]
 
 
@@ -90,6 +89,10 @@ class Session:
         """Call `listener` with a topic whenever something has changed: `scene`, `regions`, `pose`, `selected`,
         `prompt`, `settings`, `check`, `runs`."""
         self._listeners.append(listener)
+
+    def unsubscribe(self, listener: Listener) -> None:
+        """Call a listener no more."""
+        self._listeners = [other for other in self._listeners if other != listener]
 
     def start(self) -> None:
         """Begin to check and to run what is queued."""
@@ -184,8 +187,8 @@ class Session:
     def set_prompt(self, prompt: str) -> None:
         """The sentence for the next run; blank: none can be started. UserError where it is far too long."""
         words = " ".join(prompt.split())
-        if len(words) > _LONGEST_PROMPT:
-            raise UserError(f"the prompt has {len(words)} letters; at most {_LONGEST_PROMPT} are possible")
+        if len(words) > LONGEST_PROMPT:
+            raise UserError(f"the prompt has {len(words)} letters; at most {LONGEST_PROMPT} are possible")
         with self.lock:
             if words == self.state.prompt:
                 return
@@ -287,6 +290,20 @@ class Session:
             raise UserError("there is no run yet; grow a part first")
         with self._mitsuba:
             state = self.state.next_round(run)
+        self._begin_round(state)
+
+    def open_mesh(self, path: Path) -> list[str]:
+        """Make a mesh file the base of a new round, with a region on its head; what was guessed, a line each.
+
+        Raises:
+            UserError: it cannot be read or edited; all stays as it was.
+        """
+        with self._mitsuba:
+            state, said = self.state.of_mesh(path)
+        self._begin_round(state)
+        return said
+
+    def _begin_round(self, state: EditState) -> None:
         with self.lock:
             self.state, self.shown, self.beside, self.check = state, "", "", None
             self._history.clear()

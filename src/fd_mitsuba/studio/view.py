@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+import threading
 import traceback
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +15,9 @@ import numpy as np
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.studio.canvas import Canvas
 from fd_mitsuba.studio.panel import AXES, Panel
+from fd_mitsuba.studio.plain_text import without_paths
 from fd_mitsuba.studio.results import download, shown_key, shown_part, whole_result
+from fd_mitsuba.studio.uploads import Uploads
 
 if TYPE_CHECKING:
     import viser
@@ -42,18 +48,25 @@ class View:
             "grow": lambda event: self._grow(session.grow),
             "another_seed": lambda event: self._grow(session.another_seed),
             "save": lambda event: self._note(event, session.save_scene()),
-            "show": lambda event: session.show(self.panel.run_of(event.target.value)),
-            "compare": lambda event: session.compare(self.panel.run_of(event.target.value)),
+            "show": lambda event: session.show(self.panel.runs.run_of(event.target.value)),
+            "compare": lambda event: session.compare(self.panel.runs.run_of(event.target.value)),
             "stop": lambda event: session.queue.stop(session.shown),
             "resume": lambda event: session.queue.resume(session.shown),
             "download": self._download,
             "edit_again": lambda event: session.edit_again(session.shown),
             "visibility": self._visibility,
+            "shading": lambda event: self._looks(self.canvas.objects.set_shading, event),
+            "light": lambda event: self._looks(self._light, event),
         }
+        self.uploads = Uploads(server, session.work.next_upload, self._uploaded, self._refused)
         self.panel = Panel(server, session, self._heard, actions, self.canvas.visible)
         session.subscribe(self._told)
         for topic in ("scene", "settings", "prompt"):
             self._told(topic)
+
+    def close(self) -> None:
+        """Show nothing any more: the server is about to end."""
+        self.session.unsubscribe(self._told)
 
     def _told(self, topic: str) -> None:
         """Something has changed: show it. Called from any thread."""
@@ -71,10 +84,11 @@ class View:
         pose, frame = state.regions.poses.get(state.selected), state.regions.frame
         poses, meshes = list(state.regions.poses.values()), list(state.regions.meshes.values())
         if topic == "scene":
-            canvas.show_no_part()
+            canvas.objects.show_no_part()
             self._part_key = ""
             self._show_beside()
-            canvas.show_base(state.glb, frame, state.base)
+            self._light(panel.light.value)
+            canvas.objects.show_base(state.glb, frame, state.base)
         if topic in ("scene", "regions"):
             canvas.show_regions(poses, meshes, frame)
         if topic in ("scene", "regions", "selected"):
@@ -87,13 +101,13 @@ class View:
         if topic == "prompt":
             panel.show_prompt()
         if topic == "settings":
-            panel.show_settings()
+            panel.runs.show_settings()
         if topic == "check" and session.check is not None:
             panel.show_check(session.check)
             if session.check.grid is not None:
                 canvas.show_grid(*(frame.to_canonical(np.array(corner)) for corner in session.check.grid))
         if topic in ("scene", "runs"):
-            panel.show_runs()
+            panel.runs.show_runs()
             self._show_part()
             self._show_beside()
 
@@ -105,7 +119,7 @@ class View:
         self._beside_key = key
         state = self.session.state
         width = float(np.ptp(state.base.vertices[:, 0])) + _BETWEEN
-        self.canvas.show_beside(None if run is None else whole_result(run), state.regions.frame, width)
+        self.canvas.objects.show_beside(None if run is None else whole_result(run), state.regions.frame, width)
 
     def _show_part(self) -> None:
         run = self.session.queue.runs.get(self.session.shown)
@@ -115,13 +129,12 @@ class View:
         frame = self.session.state.regions.frame
         part = None if run is None else shown_part(run, frame)
         self._part_key, self._whole = key, part is not None and part.whole
+        objects = self.canvas.objects
+        objects.base_hidden = self._whole
         if part is None or not len(part.faces):
-            self.canvas.show_no_part()
-        elif part.glb is None:
-            self.canvas.show_part_mesh(part.vertices, part.faces)
+            objects.show_no_part()
         else:
-            self.canvas.show_part_glb(part.glb, frame, part.vertices, part.faces)
-        self.canvas.base_hidden = self._whole
+            objects.show_part(part.vertices, part.faces, frame, part.glb)
         self.canvas.apply_visibility()
 
     def _heard(self, handler: Callable[[Any], object]) -> Callable[[Any], None]:
@@ -142,12 +155,12 @@ class View:
         return call
 
     def _grow(self, begin: Callable[[], str]) -> None:
-        self.panel.grow.disabled = True  # the check takes a moment, in which nobody shall ask twice
+        self.panel.runs.grow.disabled = True  # the check takes a moment, in which nobody shall ask twice
         try:
             begin()
         finally:
             check = self.session.check
-            self.panel.grow.disabled = check is not None and check.refusal is not None
+            self.panel.runs.grow.disabled = check is not None and check.refusal is not None
 
     def _again(self) -> None:
         """Fields that hold what was refused go back to what is."""
@@ -176,15 +189,41 @@ class View:
             if pose is not None:
                 session.put(pose.moved(state.regions.frame.to_user(position), wxyz))
 
+    def _refused(self, client: Any, problem: str) -> None:
+        self._note(SimpleNamespace(client=client), self.session.plain(problem), "red")
+
+    def _uploaded(self, client: Any, path: Path) -> None:
+        """Open a file that has come, in a thread of its own: it may take a while, and others go on meanwhile."""
+        event = SimpleNamespace(client=client)
+
+        def open_it(event: Any) -> None:
+            try:
+                said = self.session.open_mesh(path)
+            except BaseException as error:
+                shutil.rmtree(path.parent, ignore_errors=True)
+                if isinstance(error, UserError):
+                    raise UserError(without_paths(str(error), path.parent)) from None
+                raise
+            self._note(event, "; ".join([f"{path.name} is the base now", *said]))
+
+        threading.Thread(target=self._heard(open_it), args=(event,), name="studio-import", daemon=True).start()
+
     def _visibility(self, event: Any) -> None:
         with self._lock:
             self.canvas.visible[event.target.label] = bool(event.target.value)
             self.canvas.apply_visibility()
 
+    def _light(self, name: str) -> None:
+        self.canvas.set_light(name, self.session.state.light)
+
+    def _looks(self, change: Callable[[str], None], event: Any) -> None:
+        with self._lock:
+            change(event.target.value)
+
     def _download(self, event: Any) -> None:
         run = self.session.queue.runs.get(self.session.shown)
         if run is None:
             raise UserError("there is no run yet; grow a part first")
-        wanted = self.panel.format.value
+        wanted = self.panel.runs.format.value
         name, data = download(run, wanted)
         event.client.send_file_download(name, data, save_immediately=True)

@@ -3,12 +3,14 @@
 WORK/studio.json     regions, prompt, settings: what the page shows; written whenever it changes
 WORK/scene/          a copy of the scene with all that it reads
 WORK/scene/run_001.xml   the scene as run 001 has it, beside the same meshes
-WORK/scene_2/        after "edit again": the exported result, which is the base of the second round
+WORK/scene_2/        after "edit again": the exported result, which is the base of the second round; or a mesh file
+WORK/uploads/001/    mesh files that were sent by the page
 WORK/runs/001/       run folders, as of `fd_mitsuba run`
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,10 +44,21 @@ class WorkFolder:
         """Of the scene that round 1, 2 and so on starts from."""
         return self.path / ("scene" if round_ == 1 else f"scene_{round_}")
 
+    def next_scene(self, after: int) -> int:
+        """The number of the first round behind `after` whose folder is free."""
+        return next(number for number in itertools.count(after + 1) if not self.scene_folder(number).exists())
+
     def next_run(self) -> Path:
         """A folder for the next run, `001`, `002` and so on; it is made, so that nobody else gets it."""
-        taken = [int(path.name) for path in self.runs.glob("[0-9]*") if path.name.isdecimal()]
-        folder = self.runs / f"{max(taken, default=0) + 1:03d}"
+        return self._numbered(self.runs)
+
+    def next_upload(self) -> Path:
+        """A folder for the next file that the page sends, likewise."""
+        return self._numbered(self.path / "uploads")
+
+    def _numbered(self, home: Path) -> Path:
+        taken = [int(path.name) for path in home.glob("[0-9]*") if path.name.isdecimal()]
+        folder = home / f"{max(taken, default=0) + 1:03d}"
         try:
             folder.mkdir(parents=True)
         except OSError as error:

@@ -20,12 +20,12 @@ class SeesMosaics(Protocol):
 
 
 def views_at_once(guidance: SeesMosaics | None) -> int:
-    """How many consecutive views make one picture of the guidance."""
-    return 1 if guidance is None else guidance.view_grid**2
+    """How many consecutive views the guidance sees at once, in one picture or as a group."""
+    return 1 if guidance is None else guidance.view_grid**2 * getattr(guidance, "views_together", 1)
 
 
 def check_views(stage: str, config: RunConfig, guidance: SeesMosaics | None) -> None:
-    """UserError where a stage's views do not fill the guidance's mosaics."""
+    """UserError where a stage's views do not fill the guidance's mosaics or groups."""
     views, mosaic, count = getattr(config, stage).views, views_at_once(guidance), processes().count
     if count > 1 and views % (mosaic * count):
         raise UserError(

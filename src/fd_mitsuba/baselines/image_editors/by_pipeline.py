@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from fd_mitsuba.backend.threads import network_threads
-from fd_mitsuba.baselines.image_editors.views import EditedViews
+from fd_mitsuba.baselines.image_editors.views import Beginning, EditedViews
 from fd_mitsuba.baselines.interface import EditedImages, EditTask, mesh_images
 from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.evaluation.judged_views import BACKGROUND, coloured
@@ -50,6 +50,7 @@ class PipelineEdit(EditedViews):
         super().__init__(task, steps)
         self._pipeline, self._text, self._scales = pipeline, text, scales
         self._repaints, self._sees_control = repaints, sees_control
+        self._scheduler = pipeline.scheduler
         self.side = int(pipeline.unet.config.sample_size) * int(pipeline.vae_scale_factor)
 
     def unedited(self, cameras: CameraBatch) -> EditedImages:
@@ -59,11 +60,12 @@ class PipelineEdit(EditedViews):
             return EditedImages("colour", coloured(torch.cat([shape.values, shape.mask], dim=1), "shaded"), shape.mask)
         return self._lit_base.images(cameras)
 
-    def edit(self, cameras: CameraBatch) -> EditedImages:
+    def edit(self, cameras: CameraBatch, begin: Beginning | None = None) -> EditedImages:
         """What the pipeline makes of each view, with the same random numbers for each."""
         base = self.unedited(cameras)
         inside = self.region_mask(cameras, self.side, self.side // 64) if self._repaints else None
-        seed = seed_for(self.task.config.seed, Purpose.GUIDANCE)
+        seed = seed_for(self.task.config.seed, Purpose.GUIDANCE, 0 if begin is None else begin.draw)
+        self._pipeline.scheduler = self._scheduler if begin is None else self._shorter_scheduler(begin.level)
         rows = []
         for index, picture in enumerate(base.values):
             more: dict[str, Any] = {"image": _as_image(picture), **self._scales}
@@ -71,6 +73,8 @@ class PipelineEdit(EditedViews):
                 more["mask_image"] = Image.fromarray((inside[index, 0].numpy() * 255).astype(np.uint8))
             if self._sees_control and inside is not None:
                 more["control_image"] = torch.where(inside[index] > 0, -torch.ones(()), picture)[None]
+            if begin is not None:
+                more["latents"] = self._noised(begin.images.values[index : index + 1], seed)
             with network_threads():
                 made = self._pipeline(
                     prompt=self._text,
@@ -84,6 +88,27 @@ class PipelineEdit(EditedViews):
         if values.shape[-1] != self.side:
             values = interpolate(values, size=(self.side, self.side), mode="bilinear", antialias=True)
         return EditedImages("colour", values.clamp(0, 1), _object_mask(values))
+
+    def _shorter_scheduler(self, level: float) -> Any:
+        """DDIM over the timesteps up to a share of all, in as many steps."""
+        import diffusers
+
+        scheduler: Any = diffusers.DDIMScheduler.from_config(self._scheduler.config)
+        most = round(level * scheduler.config.num_train_timesteps)
+        scheduler.register_to_config(num_train_timesteps=max(most, self.steps))
+        return scheduler
+
+    @torch.no_grad()
+    def _noised(self, picture: Tensor, seed: int) -> Tensor:
+        """Latents of a picture (1, 3, S, S) with the noise of the present scheduler's first timestep."""
+        pipeline = self._pipeline
+        vae, scheduler = pipeline.vae, pipeline.scheduler
+        found = vae.encode((2 * picture - 1).to(vae.device, vae.dtype))
+        latents = found.latents if hasattr(found, "latents") else found.latent_dist.mean
+        latents = latents * float(vae.config.scaling_factor)
+        noise = torch.randn(latents.shape, generator=torch.Generator().manual_seed(seed)).to(latents)
+        scheduler.set_timesteps(self.steps)
+        return scheduler.add_noise(latents, noise, scheduler.timesteps[:1].to(latents.device))
 
     @cached_property
     def _lit_base(self) -> _LitBase:
@@ -121,7 +146,7 @@ def load_editor(task: EditTask, kind: str, model: str, controlnet: str = "") -> 
     """
     import diffusers
 
-    folder = locate(model)
+    folder = locate(model, setting="the method's model")
     parts: dict[str, Any] = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
     device = require_device(own_device(task.config.guidance.device))
     diffusers.utils.logging.disable_progress_bar()

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from fd_mitsuba.baselines.image_editors.sampling import sample
-from fd_mitsuba.baselines.image_editors.views import EditedViews
+from fd_mitsuba.baselines.image_editors.sampling import FIRST, sample, timesteps
+from fd_mitsuba.baselines.image_editors.views import Beginning, EditedViews
 from fd_mitsuba.baselines.interface import EditedImages, EditTask, mesh_images
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
@@ -56,6 +57,7 @@ class PriorEdit(EditedViews):
                 "channels); name an image editor by the method's setting model"
             )
         self._guidance, self._repaints, self._margin = guidance, repaints, margin
+        self.side = guidance.latent_size
         scales = guidance_scale, image_guidance_scale
         with_image = guidance.has_image_pass
         self._coefficients = (
@@ -64,31 +66,39 @@ class PriorEdit(EditedViews):
 
     def unedited(self, cameras: CameraBatch) -> EditedImages:
         """The base's normals at the size of the latents."""
-        return mesh_images(base_mesh(self.scene), cameras, self._guidance.latent_size)
+        return mesh_images(base_mesh(self.scene), cameras, self.side)
 
     @torch.no_grad()
-    def edit(self, cameras: CameraBatch) -> EditedImages:
+    def edit(self, cameras: CameraBatch, begin: Beginning | None = None) -> EditedImages:
         """Sampled latents, which are normals and coverage."""
         guidance, base = self._guidance, self.unedited(cameras)
-        side, count = guidance.latent_size, len(cameras)
-        pictures = torch.cat([base.values, base.mask, base.mask], dim=1).to(guidance.device)
+        side, count, draw = self.side, len(cameras), 0 if begin is None else begin.draw
+        pictures = self._pictures(base)
         known = guidance.encode(pictures, "coarse")
-        generator = torch.Generator().manual_seed(seed_for(self.task.config.seed, Purpose.GUIDANCE))
+        generator = torch.Generator().manual_seed(seed_for(self.task.config.seed, Purpose.GUIDANCE, draw))
         noise = torch.randn(count, 4, side, side, generator=generator)
+        first = FIRST if begin is None else begin.level
+        if begin is not None:
+            level = timesteps(1, len(guidance.alpha_bars), first) * count
+            start = guidance.encode(self._pictures(begin.images), "coarse")
+            noise = sds.add_noise(start, noise.to(guidance.device), guidance.alpha_bars[level])
         texts = guidance.embeddings(single_view_prompts(guidance, cameras), self._coefficients)
         inside = self.region_mask(cameras, side, self._margin).to(guidance.device) if self._repaints else None
         rows = []
-        for begin in range(0, count, VIEWS_AT_ONCE):
-            few = slice(begin, begin + VIEWS_AT_ONCE)
+        for at in range(0, count, VIEWS_AT_ONCE):
+            few = slice(at, at + VIEWS_AT_ONCE)
             condition = guidance.seen_base(pictures[few], "coarse") if guidance.has_image_pass else None
             held = None if inside is None else (inside[few], known[few])
             own = {name: text[few] for name, text in texts.items()}
-            seed = seed_for(self.task.config.seed, Purpose.PIXELS, begin)
-            rows.append(sample(guidance, own, self._coefficients, condition, self.steps, noise[few], held, seed))
+            seed = seed_for(self.task.config.seed, Purpose.PIXELS, at)
+            rows.append(sample(guidance, own, self._coefficients, condition, self.steps, noise[few], held, seed, first))
         latents = torch.cat(rows).float().cpu()
         mask = (latents[:, 3:] + 1) / 2 if guidance.latents.signed_mask else latents[:, 3:]
         mask = mask.clamp(0, 1)
         return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
+
+    def _pictures(self, images: EditedImages) -> Tensor:
+        return torch.cat([images.values, images.mask, images.mask], dim=1).to(self._guidance.device)
 
 
 def single_view_prompts(guidance: DiffusionGuidance, cameras: CameraBatch, text: str | None = None) -> list[str]:

@@ -12,9 +12,9 @@ FIRST, LAST = 0.98, 0.02
 """Shares of the timesteps between which images are sampled: what the model is asked for when it guides, too."""
 
 
-def timesteps(steps: int, levels: int) -> list[int]:
-    """`steps` falling timesteps of a schedule with `levels` of them, evenly spread from `FIRST` to `LAST`."""
-    high, low = (round(share * (levels - 1)) for share in (FIRST, LAST))
+def timesteps(steps: int, levels: int, first: float = FIRST) -> list[int]:
+    """`steps` falling timesteps of a schedule with `levels` of them, evenly spread from `first` to `LAST`."""
+    high, low = (round(share * (levels - 1)) for share in (max(first, LAST), LAST))
     return [round(high + (low - high) * index / max(steps - 1, 1)) for index in range(steps)]
 
 
@@ -28,6 +28,7 @@ def sample(
     noise: Tensor,
     held: tuple[Tensor, Tensor] | None = None,
     seed: int = 0,
+    first: float = FIRST,
 ) -> Tensor:
     """Clean latents (N, 4, L, L) after `steps` DDIM steps from noise (N, 4, L, L).
 
@@ -38,9 +39,10 @@ def sample(
             these latents with noise of its level, and the result has them as they are (RePaint, arXiv 2201.09865,
             without its repeated steps).
         seed: of that noise.
+        first: share of the timesteps at which `noise` is; below `FIRST`, latents with the noise of that timestep.
     """
     generator = torch.Generator().manual_seed(seed)
-    times = timesteps(steps, len(denoiser.alpha_bars))
+    times = timesteps(steps, len(denoiser.alpha_bars), first)
     z, count = noise.to(denoiser.device), len(noise)
     for index, time in enumerate(times):
         now = torch.full((count,), time, device=denoiser.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,16 +14,38 @@ from fd_mitsuba.render.region_views import RegionViews
 from fd_mitsuba.scene.views import CameraBatch
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What sampling begins from, where that is not noise alone.
+
+    Attributes:
+        images: N views at the editor's size.
+        level: of the noise upon them, as a share of all timesteps in (0, 1).
+        draw: another number, another noise.
+    """
+
+    images: EditedImages
+    level: float
+    draw: int = 0
+
+
 class EditedViews(EditedObject):
     """No object behind its images: what one view shows, another need not."""
+
+    side: int
+    """Pixels a side of the model's own size."""
 
     def __init__(self, task: EditTask, steps: int) -> None:
         super().__init__(task.scene)
         self.task, self.steps = task, steps
 
     @abstractmethod
-    def edit(self, cameras: CameraBatch) -> EditedImages:
-        """The edited views at the model's own size."""
+    def edit(self, cameras: CameraBatch, begin: Beginning | None = None) -> EditedImages:
+        """The edited views at the model's own size; always the base is what is edited.
+
+        Args:
+            begin: None: sampled from noise.
+        """
 
     @abstractmethod
     def unedited(self, cameras: CameraBatch) -> EditedImages:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-
-import torch
 
 from fd_mitsuba.baselines.interface import EditedImages, EditedObject
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid
-from fd_mitsuba.baselines.voxels.rendering import render_normals
+from fd_mitsuba.baselines.voxels.rendering import grid_images
 from fd_mitsuba.baselines.voxels.surface import grid_surface
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -19,16 +18,29 @@ IMAGE_SAMPLES = 128
 
 
 class EditedVoxels(EditedObject):
-    """An edit whose outcome is a voxel grid: images are volume renderings."""
+    """An edit whose outcome is a voxel grid: images are volume renderings.
 
-    def __init__(self, scene: EditScene, grid: VoxelGrid, fit: dict[str, float]) -> None:
+    Args:
+        base: images of the unedited base that are like the grid's; None: its normals.
+    """
+
+    def __init__(
+        self,
+        scene: EditScene,
+        grid: VoxelGrid,
+        fit: dict[str, float],
+        base: Callable[[CameraBatch, int], EditedImages] | None = None,
+    ) -> None:
         super().__init__(scene, fit)
-        self.grid = grid
+        self.grid, self._base = grid, base
 
-    @torch.no_grad()
     def images(self, cameras: CameraBatch, size: int) -> EditedImages:
-        """Expected normals and coverage."""
-        return EditedImages("normals", *render_normals(self.grid, cameras, size, IMAGE_SAMPLES))
+        """Expected normals or colours, and coverage."""
+        return grid_images(self.grid, cameras, size, IMAGE_SAMPLES)
+
+    def base_images(self, cameras: CameraBatch, size: int) -> EditedImages:
+        """Of the base's own mesh, not of the grid that was fitted to it."""
+        return super().base_images(cameras, size) if self._base is None else self._base(cameras, size)
 
     @cached_property
     def _mesh(self) -> TriangleMesh | None:

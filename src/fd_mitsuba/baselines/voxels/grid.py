@@ -11,7 +11,9 @@ within a voxel. A ray is cut into equal pieces of length d, and of piece i at x_
     coverage = sum w_i,   expected normal = sum w_i n(x_i)
 
 Where Vox-E has a colour a voxel (spherical harmonics of degree 0), this grid has a normal a voxel: images for the
-guidance of shapes show normals and coverage, not colours.
+guidance of shapes show normals and coverage, not colours. A grid may have colours instead, before a plain background:
+
+    c(x) = sigmoid(raw_colour(x)),   expected colour = sum w_i c(x_i) + (1 - coverage) background
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, softplus
 
+from fd_mitsuba.baselines.interface import ImageKind
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.scene.views import CameraBatch
 
@@ -39,15 +42,26 @@ class VoxelGrid(nn.Module):
         resolution: vertices a side.
         features: numbers at each vertex beside the density.
         half_extent: the cube is [-half_extent, half_extent]^3 of the canonical frame; outside of it there is nothing.
+        kind: what the features are.
+        background: sRGB grey behind colours; black behind normals.
 
     Attributes:
         density: (R, R, R) raw, indexed z, y, x.
         features: (F, R, R, R) raw.
     """
 
-    def __init__(self, resolution: int, features: int = 3, half_extent: float = GRID_HALF_EXTENT) -> None:
+    def __init__(
+        self,
+        resolution: int,
+        features: int = 3,
+        half_extent: float = GRID_HALF_EXTENT,
+        kind: ImageKind = "normals",
+        background: float = 0.0,
+    ) -> None:
         super().__init__()
         self.resolution, self.half_extent = resolution, half_extent
+        self.kind: ImageKind = kind
+        self.background = background
         self.density = nn.Parameter(torch.full((resolution,) * 3, EMPTY))
         self.features = nn.Parameter(torch.zeros(features, resolution, resolution, resolution))
 
@@ -69,6 +83,10 @@ class VoxelGrid(nn.Module):
     def raw_of_alpha(self, alpha: float) -> float:
         """The raw density at which a piece of one voxel's length covers the share `alpha`."""
         return float(np.log(np.expm1(-np.log1p(-alpha))))
+
+    def shown(self, features: Float[Tensor, "F N"]) -> Float[Tensor, "F N"]:
+        """n(x) or c(x) of the formulas above, of raw features; gradients flow."""
+        return features.sigmoid() if self.kind == "colour" else features / features.norm(dim=0).clamp(min=1)
 
     def lookup(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "F N"]]:
         """Raw density and features at points within the cube; gradients flow to the grid."""

@@ -1,17 +1,26 @@
-"""Images of a voxel grid: expected normal and coverage, or any other value at the voxels, by volume rendering."""
+"""Images of a voxel grid: expected normal or colour, and coverage, or any other value at the voxels."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from fd_mitsuba.baselines.interface import to_camera_space
+from fd_mitsuba.baselines.interface import EditedImages, to_camera_space
 from fd_mitsuba.baselines.voxels.grid import Rays, VoxelGrid, along, interpolated, ray_weights, rays_of
 from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.scene.views import CameraBatch
 
 RAYS_AT_ONCE = 1 << 13
 _LEAST_WEIGHT = 1e-4
+
+
+@torch.no_grad()
+def grid_images(grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int) -> EditedImages:
+    """Images of what the grid has, normals in camera space or colours, without random numbers."""
+    if grid.kind == "normals":
+        return EditedImages("normals", *render_normals(grid, cameras, size, samples))
+    images = _rendered(grid, cameras, size, samples)
+    return EditedImages("colour", images[:, :3], images[:, 3:])
 
 
 def render_normals(
@@ -29,14 +38,7 @@ def render_normals(
         space: frame of the normals; `world` is the canonical frame.
         generator: moves rays within their pixels and points within their pieces; None: middles, nothing random.
     """
-    count = len(cameras) * size * size
-    pixel = None if generator is None else torch.rand(count, 2, generator=generator)
-    piece = None if generator is None else torch.rand(count, 1, generator=generator)
-    rays, rows = rays_of(cameras, size, grid.half_extent, pixel), []
-    for begin in range(0, count, RAYS_AT_ONCE):
-        few = slice(begin, begin + RAYS_AT_ONCE)
-        rows.append(traced(grid, rays.chosen(few), samples, None if piece is None else piece[few]))
-    images = _as_images(torch.cat(rows), len(cameras), size)
+    images = _rendered(grid, cameras, size, samples, generator)
     normal = images[:, :3]
     return to_camera_space(normal, cameras) if space == "camera" else normal, images[:, 3:]
 
@@ -75,7 +77,8 @@ def view_weights(grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int)
 
 
 def traced(grid: VoxelGrid, rays: Rays, samples: int, jitter: Tensor | None = None) -> Tensor:
-    """(N, 4) expected world-space normal times coverage, and coverage, along N rays; gradients flow to the grid.
+    """(N, 4) expected world-space normal times coverage, or expected colour, and coverage, along N rays; gradients
+    flow to the grid.
 
     Args:
         jitter: as in `along`.
@@ -86,10 +89,26 @@ def traced(grid: VoxelGrid, rays: Rays, samples: int, jitter: Tensor | None = No
     weights = ray_weights(grid.sigma(raw), length)
     # Normals count only where a ray ends: at one point in ten.
     ray, place = (weights.detach() > _LEAST_WEIGHT).nonzero(as_tuple=True)
-    normal = interpolated(grid.features, points[ray, place], grid.half_extent)
-    normal = normal / normal.norm(dim=0).clamp(min=1)
-    expected = normal.new_zeros(shape[0], 3).index_add(0, ray, (normal * weights[ray, place]).t())
-    return torch.cat([expected, weights.sum(dim=1, keepdim=True)], dim=1)
+    shown = grid.shown(interpolated(grid.features, points[ray, place], grid.half_extent))
+    expected = shown.new_zeros(shape[0], 3).index_add(0, ray, (shown * weights[ray, place]).t())
+    covered = weights.sum(dim=1, keepdim=True)
+    if grid.background:
+        expected = expected + grid.background * (1 - covered)
+    return torch.cat([expected, covered], dim=1)
+
+
+def _rendered(
+    grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int, generator: torch.Generator | None = None
+) -> Tensor:
+    """`traced` as images (B, 4, size, size)."""
+    count = len(cameras) * size * size
+    pixel = None if generator is None else torch.rand(count, 2, generator=generator)
+    piece = None if generator is None else torch.rand(count, 1, generator=generator)
+    rays, rows = rays_of(cameras, size, grid.half_extent, pixel), []
+    for begin in range(0, count, RAYS_AT_ONCE):
+        few = slice(begin, begin + RAYS_AT_ONCE)
+        rows.append(traced(grid, rays.chosen(few), samples, None if piece is None else piece[few]))
+    return _as_images(torch.cat(rows), len(cameras), size)
 
 
 def _as_images(rows: Tensor, count: int, size: int) -> Tensor:

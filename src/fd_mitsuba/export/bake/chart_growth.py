@@ -48,19 +48,34 @@ def grown_charts(vertices: np.ndarray, faces: np.ndarray, edges: Edges) -> np.nd
     return _smoothed(edges, faces, _merged(edges, faces, area, chart))
 
 
-def split_chart(vertices: np.ndarray, faces: np.ndarray, edges: Edges, chart: np.ndarray, number: int) -> np.ndarray:
-    """The charts with one of them cut in two along its longer side."""
+def split_chart(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    edges: Edges,
+    chart: np.ndarray,
+    number: int,
+    apart: tuple[int, int] | None = None,
+) -> np.ndarray:
+    """The charts with one of them cut in two.
+
+    Args:
+        apart: two of its faces that are to be in different halves; None: those at the ends of its longer side.
+    """
     own = np.flatnonzero(chart == number)
     middles = vertices[faces[own]].mean(axis=1)
-    axis = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)[2][0]
-    along = middles @ axis
     inside = (chart[edges.faces] == number).all(axis=1)
     place = np.full(len(faces), -1)
     place[own] = np.arange(len(own))
+    if apart is None:
+        axis = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)[2][0]
+        along = middles @ axis
+        seeds = np.array([np.argmin(along), np.argmax(along)])
+    else:
+        seeds = place[list(apart)]
     one, other = place[edges.faces[inside]].T
     length = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-12
     graph = csr_array(coo_array((length, (one, other)), shape=(len(own),) * 2))
-    halves, _ = _nearest(graph, np.array([np.argmin(along), np.argmax(along)]))
+    halves, _ = _nearest(graph, seeds)
     chart = chart.copy()
     chart[own[halves == 1]] = chart.max() + 1
     return chart

@@ -35,7 +35,7 @@ def open_notches(
     """
     left = int(_MOST * len(faces))
     for _ in range(_ROUNDS):
-        narrow = crowded(vertices[vertex_map], faces, flat, density)[:left]
+        narrow = crowded(vertices[vertex_map], faces, flat, density)[:left, 0]
         if not len(narrow):
             break
         left -= len(narrow)
@@ -65,7 +65,10 @@ def charts_of(faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def crowded(points: np.ndarray, faces: np.ndarray, flat: np.ndarray, density: float) -> np.ndarray:
-    """Faces at one side of each place that is too narrow, the worst first; arguments as those of `open_notches`."""
+    """Faces (N, 2) at both sides of each place that is too narrow, the worst first.
+
+    The arguments are those of `open_notches`.
+    """
     owner, places, where = _edge_samples(points, faces, flat, density)
     from scipy.spatial import KDTree  # imported late: whoever only names formats needs none
 
@@ -75,11 +78,11 @@ def crowded(points: np.ndarray, faces: np.ndarray, flat: np.ndarray, density: fl
     one, other = pairs.T
     excess = np.linalg.norm(where[one] - where[other], axis=1) - np.linalg.norm(places[one] - places[other], axis=1)
     bad = np.argsort(-excess, kind="stable")[: int((excess > _APART).sum())]
-    chosen: dict[int, None] = {}
-    for a, b in owner[pairs[bad]].tolist():
+    chosen: dict[int, int] = {}
+    for a, b in np.sort(owner[pairs[bad]], axis=1).tolist():
         if a not in chosen and b not in chosen:
-            chosen[min(a, b)] = None
-    return np.array(list(chosen), dtype=np.int64)
+            chosen[a] = b
+    return np.array(list(chosen.items()), dtype=np.int64).reshape(-1, 2)
 
 
 def _edge_samples(

@@ -41,11 +41,11 @@ def packed_charts(
     sides = corners[:, 1:] - corners[:, :1]
     areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) / 2
     of_face = chart[faces[:, 0]]
-    order = np.argsort(-np.bincount(of_face, areas), kind="stable")
+    area = np.bincount(of_face, areas)
     scale = cells * np.sqrt(_STARTS_AT / max(areas.sum(), 1e-30))
     for _ in range(_TRIES):
-        shapes = _shapes(flat * scale, faces, of_face, len(order), gutter)
-        places = _laid(shapes, order, cells)
+        shapes = _shapes(flat * scale, faces, of_face, len(area), gutter)
+        places = _laid_in_some_order(shapes, area, cells)
         if places is not None:
             made = np.empty_like(flat)
             for number, (quarter, at) in enumerate(places):
@@ -90,6 +90,16 @@ def _covering(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> tuple
         points.append(found.reshape(-1, 2))
         owners.append(np.repeat(of_face[chosen], len(grid)))
     return np.concatenate(points), np.concatenate(owners)
+
+
+def _laid_in_some_order(shapes: list[_Shape], area: np.ndarray, cells: int) -> list[tuple[int, np.ndarray]] | None:
+    """As `_laid`, the largest charts first, or else the longest, or those that take up the largest rectangles."""
+    sides = np.array([shape.mask.shape for shape in shapes])
+    for size in (area, sides.max(axis=1), sides.prod(axis=1)):
+        places = _laid(shapes, np.argsort(-size, kind="stable"), cells)
+        if places is not None:
+            return places
+    return None
 
 
 def _laid(shapes: list[_Shape], order: np.ndarray, cells: int) -> list[tuple[int, np.ndarray]] | None:

@@ -9,48 +9,103 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
+from scipy.spatial import ConvexHull
 
 _ROUNDS = 24
 _LEAST_WEIGHT = 0.02
 
 
-def flattened(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """Places (V, 2) of a disc's vertices in the plane, in their unit of length; None where they fold or overlap.
+class NotFlat(Exception):
+    """A chart that does not lie flat.
+
+    Attributes:
+        apart: two faces that would be better in different charts, as they overlap; None: nothing is known.
+    """
+
+    def __init__(self, apart: tuple[int, int] | None = None) -> None:
+        super().__init__()
+        self.apart = apart
+
+
+def flattened(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Places (V, 2) of a disc's vertices in the plane, in their unit of length.
 
     Args:
         vertices: (V, 3), all of them used. faces: (F, 3) a disc, counter-clockwise: so they are in the plane.
+
+    Raises:
+        NotFlat: the faces are no disc, or they fold or overlap.
     """
-    border = border_loop(faces)
-    if border is None:
-        return None
+    loops = border_loops(faces)
+    if len(loops) != 1:
+        raise NotFlat(_beside_a_hole(faces, loops))
+    border = loops[0]
     shapes = _in_their_planes(vertices, faces)
     start = _tutte(vertices, faces, border)
-    if start is None:
-        return None
     flat = _as_rigid_as_possible(shapes, faces, start)
     corners = flat[faces]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    if not (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0).all() or _crosses_itself(flat[border]):
-        return None
+    if not (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0).all():
+        raise NotFlat
+    crossing = _crossing(flat[border])
+    if crossing is not None:
+        first, second = (_face_of(faces, border[side], border[(side + 1) % len(border)]) for side in crossing)
+        raise NotFlat((first, second))
     return _upright(flat)
 
 
-def border_loop(faces: np.ndarray) -> np.ndarray | None:
-    """The vertices (B,) along the border of a mesh, in the order of its faces; None unless it is one closed loop."""
+def pinched_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The faces (F, 3) with a vertex of its own for each fan of them around a vertex, and (S,) which vertex each was.
+
+    A chart that touches itself at a vertex is a disc only then.
+    """
+    corner = np.arange(faces.size).reshape(-1, 3)
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    after = np.roll(corner, -1, axis=1).reshape(-1)
+    count = int(faces.max()) + 1
+    order = np.argsort(start * count + end)
+    keys = (start * count + end)[order]
+    wanted = end * count + start
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    found = keys[place] == wanted
+    twin = order[place[found]]
+    # Across an inner edge a corner at its start is the twin's at its end.
+    one, other = np.concatenate([corner.reshape(-1)[found], after[found]]), np.concatenate([after[twin], twin])
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(faces.size,) * 2)
+    fan = connected_components(graph, directed=False)[1]
+    _, first = np.unique(fan, return_index=True)
+    return fan.reshape(-1, 3).astype(np.int64), faces.reshape(-1)[first]
+
+
+def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """The loops of vertices (B,) along the border of a mesh, in the order of its faces; none where it is pinched."""
     start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
     count = int(faces.max()) + 1
     alone = ~np.isin(start * count + end, end * count + start)
     following = dict(zip(start[alone].tolist(), end[alone].tolist(), strict=True))
-    if not following or len(following) != alone.sum():
+    if len(following) != alone.sum():
+        return []
+    loops = []
+    while following:
+        loop = [next(iter(following))]
+        while (after := following.pop(loop[-1])) != loop[0]:
+            loop.append(after)
+        loops.append(np.array(loop))
+    return loops
+
+
+def _beside_a_hole(faces: np.ndarray, loops: list[np.ndarray]) -> tuple[int, int] | None:
+    """Faces at opposite sides of the smallest hole: a cut between them goes through it."""
+    if not loops:
         return None
-    loop = [next(iter(following))]
-    while (after := following.get(loop[-1])) is not None and after != loop[0] and len(loop) <= len(following):
-        loop.append(after)
-    return np.array(loop) if len(loop) == len(following) else None
+    hole = min(loops, key=len)
+    half = len(hole) // 2
+    return _face_of(faces, hole[0], hole[1]), _face_of(faces, hole[half], hole[(half + 1) % len(hole)])
 
 
-def _tutte(vertices: np.ndarray, faces: np.ndarray, border: np.ndarray) -> np.ndarray | None:
+def _tutte(vertices: np.ndarray, faces: np.ndarray, border: np.ndarray) -> np.ndarray:
     """Border vertices on a circle at their distances from each other, the others each in the middle of its ring."""
     closed = np.concatenate([border, border[:1]])
     along = np.cumsum(np.linalg.norm(np.diff(vertices[closed], axis=0), axis=1))
@@ -118,8 +173,8 @@ def _as_rigid_as_possible(shapes: np.ndarray, faces: np.ndarray, flat: np.ndarra
     return flat
 
 
-def _crosses_itself(loop: np.ndarray) -> bool:
-    """Whether a closed polygon (N, 2) has two sides that cross."""
+def _crossing(loop: np.ndarray) -> tuple[int, int] | None:
+    """Two sides of a closed polygon (N, 2) that cross, by the numbers of their starts; None: none do."""
     start, end = loop, np.roll(loop, -1, axis=0)
     side = end - start
 
@@ -128,11 +183,22 @@ def _crosses_itself(loop: np.ndarray) -> bool:
         return along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0]
 
     parts = left(start, side, start) * left(start, side, end) < 0
-    return bool((parts & parts.T).any())
+    first, second = np.nonzero(parts & parts.T)
+    return (int(first[0]), int(second[0])) if len(first) else None
+
+
+def _face_of(faces: np.ndarray, start: int, end: int) -> int:
+    """The face that has the edge from `start` to `end`."""
+    return int(np.flatnonzero(((faces == start) & (np.roll(faces, -1, axis=1) == end)).any(axis=1))[0])
 
 
 def _upright(flat: np.ndarray) -> np.ndarray:
-    """Turned so that its longer side runs along an axis: such charts pack better."""
-    centred = flat - flat.mean(axis=0)
-    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
-    return centred @ np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
+    """Turned so that the rectangle around it is as small as it can be, with its longer side along x: so charts pack."""
+    hull = flat[ConvexHull(flat).vertices]
+    side = np.roll(hull, -1, axis=0) - hull
+    side /= np.linalg.norm(side, axis=1, keepdims=True)  # a smallest rectangle lies along a side of the hull
+    along = np.ptp(hull @ side.T, axis=0)
+    across = np.ptp(hull @ (side[:, ::-1] * [-1, 1]).T, axis=0)
+    best = int(np.argmin(along * across))
+    x, y = side[best] if along[best] >= across[best] else side[best, ::-1] * [-1, 1]
+    return (flat - flat.mean(axis=0)) @ np.array([[x, -y], [y, x]])

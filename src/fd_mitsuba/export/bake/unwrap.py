@@ -21,7 +21,7 @@ import xatlas
 from fd_mitsuba.export.bake.chart_growth import grown_charts, split_chart
 from fd_mitsuba.export.bake.chart_notches import charts_of, crowded, open_notches
 from fd_mitsuba.export.bake.chart_packing import packed_charts
-from fd_mitsuba.export.bake.flatten import flattened
+from fd_mitsuba.export.bake.flatten import NotFlat, flattened, pinched_apart
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
@@ -105,41 +105,44 @@ def _wide_charts(
     except ValueError:
         return None
     chart = grown_charts(vertices, faces, edges)
-    laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # its faces, their vertices, places
+    laid: dict[
+        int, tuple[np.ndarray, ...]
+    ] = {}  # its faces, their corners in its own vertices, which those are, places
     tries, found = 0, None
     for _ in range(_ROUNDS):
         waiting = [number for number in np.unique(chart).tolist() if number not in laid]
         while waiting:
             number = waiting.pop()
             own = np.flatnonzero(chart == number)
-            used, local = np.unique(faces[own], return_inverse=True)
-            flat = flattened(vertices[used], local.reshape(-1, 3))
-            if flat is not None:
-                laid[number] = own, used, flat
-                continue
-            tries += 1
-            if tries > _TRIES or len(own) < 2:
-                return None
-            fresh = int(chart.max()) + 1
-            chart = split_chart(vertices, faces, edges, chart, number)
-            waiting += [number, fresh]
+            local, used = pinched_apart(faces[own])
+            try:
+                laid[number] = own, local, used, flattened(vertices[used], local)
+            except NotFlat as bad:
+                tries += 1
+                if tries > _TRIES or len(own) < 2:
+                    return None
+                apart = None if bad.apart is None else (int(own[bad.apart[0]]), int(own[bad.apart[1]]))
+                waiting += [number, int(chart.max()) + 1]
+                chart = split_chart(vertices, faces, edges, chart, number, apart)
         vertex_map, split, flat = found = _side_by_side(faces, laid)
         narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
-        for number in np.unique(chart[narrow]).tolist():
-            chart = split_chart(vertices, faces, edges, chart, number)
-            del laid[number]
+        for one, other in narrow.tolist():
+            number = int(chart[one])
+            if number in laid and chart[other] == number:  # of each chart the worst place first
+                chart = split_chart(vertices, faces, edges, chart, number, (one, other))
+                del laid[number]
         if not len(narrow):
             break
     return found
 
 
 def _side_by_side(
-    faces: np.ndarray, laid: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    faces: np.ndarray, laid: dict[int, tuple[np.ndarray, ...]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertex map, split faces and places of charts, none of which overlaps another."""
     split, vertex_map, places, count, corner = np.empty_like(faces), [], [], 0, 0.0
-    for own, used, flat in laid.values():
-        split[own] = np.searchsorted(used, faces[own]) + count
+    for own, local, used, flat in laid.values():
+        split[own] = local + count
         vertex_map.append(used)
         places.append(flat - flat.min(axis=0) + [corner, 0.0])
         corner += float(np.ptp(flat[:, 0])) * 1.1

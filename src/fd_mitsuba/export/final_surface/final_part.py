@@ -22,7 +22,7 @@ import torch
 from fd_mitsuba.export.final_surface.contact import contact_of
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
-from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach, fillet_width
+from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach
 from fd_mitsuba.export.final_surface.rim import rim_normals
 from fd_mitsuba.export.final_surface.shading import smooth_normals
 from fd_mitsuba.export.solid.decimation import decimated
@@ -117,15 +117,13 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
     extractor, grid = grown.extractor, coarse.grid
     base = None if coarse.cuts else MeshDistance(grown.base.vertices, grown.base.faces)
 
-    width = fillet_width(extractor.union_k)
-
     def sdf_part(points: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
         return grown.field.evaluate(points, region).sdf
 
+    reach = fillet_reach(extractor.union_k, _FILM_CELLS * grid.spacing)
     function = PartFunction(
-        sdf_part, list(grown.parts.values()), coarse.number, grid, base, width, extractor.union_only_outside,
-        fillet_reach(width, _FILM_CELLS * grid.spacing), coarse.sink,
-        _lattice(coarse, coarse.sdf_base), coarse.bridges,
+        sdf_part, list(grown.parts.values()), coarse.number, grid, base, extractor.union_k,
+        extractor.union_only_outside, reach, coarse.sink, _lattice(coarse, coarse.sdf_base), coarse.bridges,
     )  # fmt: skip
     if base is None:
         return function

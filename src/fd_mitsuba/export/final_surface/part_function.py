@@ -1,7 +1,7 @@
 """A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
 
     part   = min(sdf_part, region + margin, room)      where the part may be at all
-    blend  = part, but -away at the base's surface and inside it, from one to the other within the fillet's width
+    blend  = part, but -away at the base's surface and inside it, from one to the other within 0.4 k
     joined = max(sdf_base - 2 max(away - reach, 0), blend) + fillet(sdf_base, blend)
     value  = min(joined, sink - sdf_base, lead)        positive inside the solid
 
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.export.final_surface.contact import Contact
+from fd_mitsuba.export.final_surface.projection import FLATTEST
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
 from fd_mitsuba.extraction.active_vertices import DEFAULT_MARGIN
 from fd_mitsuba.extraction.tet_grid import TetGrid
@@ -39,18 +40,14 @@ _ROUND_CELLS = 0.75
 """Of the solid's lower edge, which nobody sees: triangles across a sharp one would be off its surface."""
 
 
-def fillet_width(union_k: float) -> float:
-    """The width of a fillet without a crease that is as high where base and part meet as `soft_union`'s of `union_k`.
-
-    A fillet h^2 / (4 width), h = max(width - |sdf_base - sdf_part|, 0), is tangent to both surfaces. That of
-    `soft_union` is wider and flatter, and keeps 62 of the 90 degrees between a wall and the floor that it stands on.
-    """
+def over_base(union_k: float) -> float:
+    """How wide the fillet is over the base, canonical units; see `PartFunction`."""
     return 0.4 * union_k
 
 
-def fillet_reach(width: float, film: float) -> float:
-    """How far from the part the fillet of `width` is higher than `film` over a flat base, canonical units."""
-    return max(width - math.sqrt(4 * width * film), 0.0)
+def fillet_reach(union_k: float, film: float) -> float:
+    """How far from the part the fillet is higher than `film` over a flat base, canonical units."""
+    return over_base(union_k) * max(1 - math.sqrt(10 * film / max(union_k, 1e-12)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class PartFunction:
         number: the part that is meant; None: all together.
         grid: the lattice of the training; the part keeps away from its border.
         base: the base's surface; None where the part is cut out: then the solid is the part alone.
-        width: of the fillet, canonical units; see `fillet_width`.
+        width: of the fillet, canonical units: the `k` of `soft_union`.
         union_only_outside: see `soft_union`.
         reach: how far from the part the fillet is shown, canonical units.
         sink: see `part_solid`.
@@ -109,11 +106,16 @@ class PartFunction:
         rows = self._in_pieces(points, both)
         return rows[:, 0], rows[:, 1:]
 
-    def rim(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """About how far (N,) points (N, 3) are from the zero set, canonical units: |value| / |gradient|."""
+        values, slopes = self.with_gradient(points)
+        return np.abs(values) / np.maximum(np.linalg.norm(slopes, axis=1), FLATTEST)
+
+    def rim(self, points: np.ndarray, within: float) -> tuple[np.ndarray, np.ndarray]:
         """Two values (N, 2), and gradients (N, 2, 3), that are 0 along the rim where the solid dives under the base.
 
         The first is how much further than `reach` from the part, the second 0 on the surface as if it did not dive.
-        Infinite, with gradients of 0, where no base is near.
+        Infinite, with gradients of 0, where no base is near, or the first is larger than `within`, canonical units.
         """
         points = np.asarray(points, dtype=np.float64)
         values, gradients = np.full((len(points), 2), np.inf), np.zeros((len(points), 2, 3))
@@ -121,8 +123,11 @@ class PartFunction:
             return values, gradients
         x = torch.from_numpy(points.astype(np.float32))
         near = np.flatnonzero(self._nearest(self.base_lattice, x) > -2 * self.grid.spacing)
+        from_part, slope = self.contact.at(points[near])
+        close = np.abs(from_part - self.reach) <= within
+        near = near[close]
         x = x[torch.from_numpy(near)].requires_grad_()
-        away = _attached(x, *self.contact.at(x.detach().double().numpy()))
+        away = _attached(x, from_part[close], slope[close])
         for number, value in enumerate(
             [away - self.reach, self._joined(self._base_at(x), self._part(x, True), away, 0)]
         ):
@@ -167,16 +172,30 @@ class PartFunction:
 
     def _joined(self, base: Tensor, part: Tensor, away: Tensor, lower: Tensor | float) -> Tensor:
         if self.width > 0:
-            part = torch.lerp(part, -away, smoothstep(1 + base / self.width))
-        return torch.maximum(base - lower, part) + self._fillet(base, part)
+            part = torch.lerp(part, -away, smoothstep(1 + base / over_base(self.width)))
+        higher = torch.maximum(base - lower, part)
+        fillet = self._fillet(base, part)
+        # Beyond the rim the fillet goes on below the base's surface, or the solid would end on it in a ledge.
+        return higher + (torch.where(higher < 0, fillet, 0.0) if self.union_only_outside else fillet)
 
     def _fillet(self, base: Tensor, part: Tensor) -> Tensor:
-        if self.width == 0:
+        """The fillet (N,): as high where base and part meet as that of `soft_union`, without the crease that it leaves.
+
+        Up the part it is as wide as `soft_union`'s, so that the shape and volume that were trained stay; over the base
+        it ends at `w = 0.4 k`, so that it does not run over what lies beside the part. With d = |base - part|:
+
+            over the base   0.1 k (1 - d / w)^2
+            up the part     0.1 k (1 - d / k)^2 - 0.3 d (1 - d / w)^2
+
+        Both have the slope -1/2 at d = 0, where that of the maximum is 1/2.
+        """
+        k, narrow = self.width, over_base(self.width)
+        if k == 0:
             return torch.zeros_like(part)
-        overlap = (self.width - (base - part).abs()).clamp(min=0)
-        if self.union_only_outside:
-            overlap = torch.where(torch.maximum(base, part) < 0, overlap, 0.0)
-        return overlap * overlap / (4 * self.width)
+        apart = (base - part).abs()
+        wide, short = (1 - apart / k).clamp(min=0), (1 - apart / narrow).clamp(min=0)
+        short = short * short
+        return torch.where(base > part, 0.1 * k * short, 0.1 * k * wide * wide - 0.3 * apart * short)
 
     def _part(self, x: Tensor, swollen: bool) -> Tensor:
         region = self._region([region for regions in self.parts for region in regions], x)
@@ -227,8 +246,8 @@ class PartFunction:
             return torch.from_numpy(value)
         gradient = np.empty_like(points)
         for axis, step in enumerate(np.eye(3) * _STEP):
-            ahead, behind = union_sdf(list(regions), points + step), union_sdf(list(regions), points - step)
-            gradient[:, axis] = (ahead.astype(np.float64) - behind) / (2 * _STEP)
+            # One-sided: half the time for an error of half a step over the region's radius.
+            gradient[:, axis] = (union_sdf(list(regions), points + step).astype(np.float64) - value) / _STEP
         return _attached(x, value, gradient)
 
 

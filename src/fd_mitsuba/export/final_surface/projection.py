@@ -9,7 +9,7 @@ import numpy as np
 WithGradient = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (N, 3) -> values (N,) and gradients (N, 3)."""
 
-_FLATTEST = 0.1
+FLATTEST = 0.1
 """A gradient is taken for at least so long: a flat spot of a field must not throw points away."""
 
 
@@ -34,7 +34,7 @@ def project(
         moving = np.flatnonzero(np.abs(value) > near)
         if not len(moving):
             break
-        slope = np.maximum(np.linalg.norm(gradient[moving], axis=1), _FLATTEST)
+        slope = np.maximum(np.linalg.norm(gradient[moving], axis=1), FLATTEST)
         step = np.clip(value[moving] / slope, -longest, longest) / slope * share[moving]
         tried = best[moving] - step[:, None] * gradient[moving]
         tried_value, tried_gradient = function(tried)
@@ -44,4 +44,4 @@ def project(
         share[moving] = np.where(better, np.minimum(2 * share[moving], 1), share[moving] / 3)
     slope = np.linalg.norm(gradient, axis=1)
     normal = -gradient / np.maximum(slope, 1e-12)[:, None]
-    return best, normal, np.abs(value) / np.maximum(slope, _FLATTEST)
+    return best, normal, np.abs(value) / np.maximum(slope, FLATTEST)

@@ -48,7 +48,10 @@ def remesh(
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     rng = np.random.default_rng(0)
     for number in range(rounds):
-        vertices, faces = _split(vertices, faces, _LONG * edge)
+        edges = edges_of(faces, len(vertices))
+        long = _lengths(vertices, edges.ends) > _LONG * edge
+        if long.any():
+            vertices, faces = halved(vertices, faces, edges, long)
         for _ in range(16 if number == 0 else 6):
             vertices, faces, changed = _collapse(vertices, faces, edge, rng)
             if not changed:
@@ -97,12 +100,8 @@ def unfolded(
         after[corners] = before[corners]
 
 
-def _split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Every longer edge halved; faces cut into two, three or four."""
-    edges = edges_of(faces, len(vertices))
-    long = _lengths(vertices, edges.ends) > longest
-    if not long.any():
-        return vertices, faces
+def halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The marked edges (E,) halved, the new vertices last; faces cut into two, three or four."""
     middle = np.full(len(long), -1)
     middle[long] = len(vertices) + np.arange(long.sum())
     vertices = np.concatenate([vertices, vertices[edges.ends[long]].mean(axis=1)])

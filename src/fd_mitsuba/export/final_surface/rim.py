@@ -14,8 +14,9 @@ from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 from fd_mitsuba.export.final_surface.remesh import unfolded
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 
-Rim = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Points (N, 3) -> two values (N, 2), both 0 on the rim, and their gradients (N, 2, 3); infinite far from it."""
+Rim = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
+"""Points (N, 3) and a distance -> two values (N, 2), both 0 on the rim, and their gradients (N, 2, 3); infinite where
+the first is larger than the distance."""
 
 _NEAR = 0.4
 """Vertices as near to the rim as this, in edges, are drawn to it."""
@@ -24,6 +25,8 @@ _ON = 0.02
 _BELOW = 2.0
 """How far below the fillet, in edges, the other end of an edge that starts on it can be."""
 _STEPS = 5
+_WITHIN = 2.5
+"""What is farther beyond the rim, in edges, has no edge across it."""
 
 
 def drawn_to_rim(rim: Rim, points: np.ndarray, edge: float) -> np.ndarray:
@@ -32,7 +35,7 @@ def drawn_to_rim(rim: Rim, points: np.ndarray, edge: float) -> np.ndarray:
     Args:
         edge: the mesh's, in the points' unit.
     """
-    near = np.flatnonzero(_distance(rim, points) < _NEAR * edge)
+    near = np.flatnonzero(_distance(rim, points, edge) < _NEAR * edge)
     moved, there = _onto(rim, points[near], edge)
     points = points.copy()
     points[near[there]] = moved[there]
@@ -67,7 +70,7 @@ def rim_normals(rim: Rim, vertices: np.ndarray, below: float) -> tuple[np.ndarra
     They are those of the fillet, as if it went on: what is seen between the rim and the base is a hair's breadth, and
     shaded as the flank that it is it would be a dark line around the part.
     """
-    values, gradients = rim(vertices)
+    values, gradients = rim(vertices, 2 * below)
     side = values[:, 0] / np.maximum(np.linalg.norm(gradients[:, 0], axis=1), 1e-3)
     chosen = np.flatnonzero((side > -_ON * below) & (side < below) & (np.abs(values[:, 1]) < _BELOW * below))
     slope = gradients[chosen, 1]
@@ -78,13 +81,13 @@ def rim_normals(rim: Rim, vertices: np.ndarray, below: float) -> tuple[np.ndarra
 
 def _side(rim: Rim, points: np.ndarray, edge: float) -> np.ndarray:
     """How far (N,) beyond the rim points are, negative on the fillet; NaN where the rim is nowhere near."""
-    values, gradients = rim(points)
+    values, gradients = rim(points, _WITHIN * edge)
     side = values[:, 0] / np.maximum(np.linalg.norm(gradients[:, 0], axis=1), 1e-3)
     return np.where(np.isfinite(values).all(axis=1) & (np.abs(values[:, 1]) < _BELOW * edge), side, np.nan)
 
 
-def _distance(rim: Rim, points: np.ndarray) -> np.ndarray:
-    values, gradients = rim(points)
+def _distance(rim: Rim, points: np.ndarray, edge: float) -> np.ndarray:
+    values, gradients = rim(points, _WITHIN * edge)
     return (np.abs(values) / np.maximum(np.linalg.norm(gradients, axis=2), 1e-3)).max(axis=1)
 
 
@@ -92,12 +95,12 @@ def _onto(rim: Rim, points: np.ndarray, edge: float) -> tuple[np.ndarray, np.nda
     """Points (N, 3) on the rim by the shortest way, and which of them (N,) got there within an edge."""
     moved = np.array(points, dtype=np.float64)
     for _ in range(_STEPS):
-        values, gradients = rim(moved)
+        values, gradients = rim(moved, _WITHIN * edge)
         finite = np.isfinite(values).all(axis=1)
         jacobian = gradients[finite]
         square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-4 * np.eye(2)
         step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, values[finite][..., None]))[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         moved[finite] -= step * np.minimum(1, 0.5 * edge / np.maximum(length, 1e-12))
-    there = _distance(rim, moved) < _ON * edge
+    there = _distance(rim, moved, edge) < _ON * edge
     return moved, there & (np.linalg.norm(moved - points, axis=1) < edge)
