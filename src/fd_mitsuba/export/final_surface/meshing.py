@@ -23,7 +23,7 @@ _THINNED, _WORTH_THINNING = 1.4, 1.3
 """How many times the triangles aimed at remeshing starts from, and how many times more there must be for that."""
 _TRIES = 3
 """Times that the edge is lengthened if there are still more faces than wanted."""
-_RIM_ROUNDS = 3
+_ROUNDS, _RIM_ROUNDS = 4, 3
 _LEAST_ANGLE_DEG = 12.0
 _LEAST_AT_RIM_DEG = 6.0
 _MAY_MOVE_CELLS = 0.05
@@ -71,7 +71,7 @@ def evenly_meshed(
         return remesh(vertices, triangles, edge, onto, rounds)
 
     vertices, triangles = _thinned(vertices, triangles, round(_THINNED * _MESHED * faces))
-    vertices, triangles = remeshed(vertices, triangles, edge, 6)
+    vertices, triangles = remeshed(vertices, triangles, edge, _ROUNDS)
     for _ in range(_TRIES):
         if len(triangles) <= faces:
             break
