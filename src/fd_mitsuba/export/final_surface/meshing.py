@@ -94,13 +94,13 @@ def _thinned(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[n
     """
     if len(triangles) < _WORTH_THINNING * count:
         return vertices, triangles
-    fewer, left, _, _ = igl.decimate(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), count)
-    left = np.asarray(left, dtype=np.int64)
+    made = igl.decimate(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), count)
+    fewer, left = np.asarray(made[0], dtype=np.float64), np.asarray(made[1], dtype=np.int64)
     try:
         edges_of(left, len(fewer))
     except ValueError:
         return vertices, triangles
-    return np.asarray(fewer, dtype=np.float64), left
+    return fewer, left
 
 
 def _closely(
