@@ -93,7 +93,7 @@ def test_three_steps_of_both_phases(folders: dict[str, Path], kind: str) -> None
         ("sd21", "refined", "sds"),
         ("ip2p", "refined", "csd"),
         ("ip2p", "coarse", OF_TWO_STEPS),
-        ("sd15", "coarse", "ism"),
+        ("sd15", "coarse", {"kind": "ism", "inversion_step": 0.4}),
     ],
 )
 def test_chunks_give_what_one_call_gives(folders: dict[str, Path], kind: str, phase: str, variant: str | dict) -> None:
