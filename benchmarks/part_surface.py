@@ -112,7 +112,9 @@ class Trained(PartFunction):
 
 def meant_solid(function: PartFunction, coarse: LatticePart) -> Solid:
     """What the training's grid would march if it were three times finer."""
-    own = {item.name: getattr(function, item.name) for item in fields(function)} | {"reach": coarse.reach}
+    own: dict[str, Any] = {item.name: getattr(function, item.name) for item in fields(function)} | {
+        "reach": coarse.reach
+    }
     shape = (coarse.grid.side,) * 3
     made = refined(coarse.grid, torch.stack(coarse.fields).amin(dim=0).view(shape).numpy(), Trained(**own).values, 3)
     return Solid(*made.surface(made.values > 0)) if made else Solid(np.zeros((0, 3)), np.zeros((0, 3)))

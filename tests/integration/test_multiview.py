@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import diffusers
 import numpy as np
@@ -22,8 +23,10 @@ from tiny_runs import write_place
 from torch import Tensor
 
 from fd_mitsuba.backend.processes import Processes
+from fd_mitsuba.baselines.edit_maps import refuse_without_attention
+from fd_mitsuba.baselines.voxe import VoxeSettings
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import diffusion, loading, step_draws
@@ -222,6 +225,30 @@ def test_a_view_pulls_at_the_others_of_its_group_alone(root: Path, variant: str 
     changed = gradient_of(guidance, views) - gradient_of(guidance, replace(views, pictures=other.requires_grad_()))
     apart = changed[:, :4].abs().amax(dim=(1, 2, 3))
     assert (apart[:4] > 1e-6).all() and (apart[4:] == 0).all()
+
+
+def test_a_critic_is_told_the_cameras_too(root: Path) -> None:
+    """One that has learned nothing sees what the model sees, which leaves (7.5 - 1) times the classifier score."""
+    guidance, views = load(root / "mvdream", variant="vsd", guidance_scale=7.5), views_of()
+    plain = load(root / "mvdream", variant="csd")
+    first, expected = (
+        torch.autograd.grad(asked.guide(views, 0, 10, "coarse", 3).loss, views.pictures)[0]
+        for asked in (guidance, plain)
+    )
+    assert_close(first, 6.5 * expected)
+    moved = [value for name, value in guidance.learned_state().items() if name.endswith(".up")]
+    assert all(value.abs().max() > 0 for value in moved), "every layer has learned"
+    times, _ = guidance._lesson(views, 1, "coarse", 3)
+    assert times[0] == times[3] != times[4] == times[7]
+
+
+def test_a_baseline_that_looks_at_single_views_refuses_it(root: Path) -> None:
+    task = SimpleNamespace(
+        guidance=SimpleNamespace(inner=load(root / "mvdream")),
+        config=RunConfig.load(None, ["guidance.model=mvdream"]),
+    )
+    with pytest.raises(UserError, match="guidance.model = mvdream: voxe needs a diffusion model that sees one whole"):
+        refuse_without_attention(task, VoxeSettings())
 
 
 def test_a_part_with_a_prompt_of_its_own_is_told_the_same_cameras(root: Path) -> None:

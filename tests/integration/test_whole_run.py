@@ -198,7 +198,7 @@ def test_without_a_finished_shape(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction"])
+@pytest.mark.parametrize("variant", ["csd", "ism", "reconstruction", "vsd"])
 def test_every_variant_runs_both_stages(place: Path, variant: str) -> None:
     more = ["--set", f"guidance.variant={variant}", "--set", "geometry.steps=3", "--set", "guidance.guidance_scale=7.5"]
     assert run(place, variant, *more) == 0

@@ -77,7 +77,7 @@ def build_pipeline(kind: str, seed: int = 0, with_unet: bool = True) -> diffuser
     """`sd15` (eps), `sd21` (v, OpenCLIP-like text encoder), `ip2p` (8 channels), `inpaint` (9), `tiny_vae`.
 
     Args:
-        with_unet: else `sd21` has none.
+        with_unet: else it has none.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -103,7 +103,9 @@ def build_pipeline(kind: str, seed: int = 0, with_unet: bool = True) -> diffuser
             ),
             text_encoder=tiny_text_encoder(tokenizer),
             tokenizer=tokenizer,
-            unet=diffusers.UNet2DConditionModel(**UNET_1_5, in_channels={"ip2p": 8, "inpaint": 9}.get(kind, 4)),
+            unet=diffusers.UNet2DConditionModel(**UNET_1_5, in_channels={"ip2p": 8, "inpaint": 9}.get(kind, 4))
+            if with_unet
+            else None,
             scheduler=diffusers.PNDMScheduler(**BETAS, skip_prk_steps=True, steps_offset=1),
         )
         if kind == "ip2p":

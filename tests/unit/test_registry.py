@@ -25,6 +25,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.formats import EXPORTERS
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.sources import load_guidance
 from fd_mitsuba.guidance.variants import VARIANTS
 from fd_mitsuba.runs.choices import REGISTRIES, checked_choices, described
@@ -60,6 +61,16 @@ def a_gradient_points_from_the_free_mean_to_the_text_mean(name: str) -> None:
     what = chunk(300, 700)
     gradient, preview = denoiser().latent_gradient(what, how(name, guidance_scale=7.5))
     assert gradient.shape == preview.shape == what.z.shape and gradient.mean() < 0
+
+
+@shows("variants", "vsd")
+def a_critic_that_has_learned_nothing_is_the_model(name: str) -> None:
+    critic = Critic(torch.nn.ModuleDict({"a": torch.nn.ModuleDict({"to_q": torch.nn.Linear(2, 2)})}), 4, 1e-4)
+    what = chunk(300, 700)
+    gradient, preview = denoiser().latent_gradient(what, how(name, guidance_scale=7.5, critic=critic))
+    expected, _ = denoiser().latent_gradient(what, how("csd"))
+    torch.testing.assert_close(gradient, 6.5 * expected)
+    assert preview.shape == what.z.shape
 
 
 @shows("geometry_losses", "focal", "collision", "volume", "presence", "tether")

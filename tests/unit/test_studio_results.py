@@ -25,9 +25,11 @@ from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.studio import runner
+from fd_mitsuba.studio import session as sessions
 from fd_mitsuba.studio.adopted_run import adopt
 from fd_mitsuba.studio.base_glb import base_glb, only_parts
 from fd_mitsuba.studio.job import EventReader, EventWriter, RunOrder
+from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.live_part import live_part
 from fd_mitsuba.studio.opening import open_target
 from fd_mitsuba.studio.results import download, shown_part
@@ -217,7 +219,8 @@ def opened_with(scene: Path, work: Path, run: Path):
     return replace(open_target(scene, work, {}, say=lambda line: None), shown=run.name, run=run)
 
 
-def test_edit_again_makes_the_result_the_base(make_scene, mi, tmp_path: Path) -> None:
+def test_edit_again_makes_the_result_the_base(make_scene, mi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "live_check", lambda scene, config: LiveCheck())
     opened = open_target(make_scene(), tmp_path / "work", {}, say=lambda line: None)
     session = Session(opened, StudioSettings("smoke"), program=(sys.executable, "-I", "-c", ""))
     name = session.grow()

@@ -13,8 +13,10 @@ import pytest
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.studio import session as sessions
 from fd_mitsuba.studio.history import History
 from fd_mitsuba.studio.job import RunOrder
+from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.opening import open_target
 from fd_mitsuba.studio.plain_text import without_paths
 from fd_mitsuba.studio.run_state import QUEUED
@@ -28,6 +30,17 @@ SMOKE = StudioSettings("smoke")
 def opened(target: Path, work: Path, **parameters: str) -> Session:
     found = open_target(target, work, parameters, say=lambda line: None)
     return Session(found, SMOKE, program=NOTHING, say=lambda line: None)
+
+
+@pytest.fixture
+def checks() -> None:
+    """Wanted by tests of what the check says; all others are spared its time."""
+
+
+@pytest.fixture(autouse=True)
+def no_check(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "checks" not in request.fixturenames:
+        monkeypatch.setattr(sessions, "live_check", lambda scene, config: LiveCheck())
 
 
 @pytest.fixture
@@ -73,7 +86,7 @@ def test_a_click_puts_a_region_on_the_base(session: Session) -> None:
     assert session.add() == "region_2"
 
 
-def test_check_reads_the_prompt_and_refuses(session: Session) -> None:
+def test_check_reads_the_prompt_and_refuses(session: Session, checks: None) -> None:
     session.set_prompt("a pig with wings")
     fine = session.check_now()
     assert fine.refusal is None and "wing" in fine.told and "s for the shape" in fine.estimate
@@ -138,7 +151,7 @@ def test_save_scene_refuses_regions_that_changed_in_the_file(session: Session, s
     assert scene.read_bytes() == before
 
 
-def test_a_scene_without_regions_gets_its_first_one_here(make_scene, mi, tmp_path: Path) -> None:
+def test_a_scene_without_regions_gets_its_first_one_here(make_scene, mi, tmp_path: Path, checks: None) -> None:
     scene = make_scene(region="")
     session = opened(scene, tmp_path / "work")
     assert session.state.selected == "" and "no region yet" in str(session.check_now().refusal)
@@ -204,7 +217,7 @@ def test_edit_again_needs_a_result(session: Session) -> None:
         session.edit_again("")
 
 
-def test_no_path_of_the_disk_is_shown(session: Session, tmp_path: Path) -> None:
+def test_no_path_of_the_disk_is_shown(session: Session, tmp_path: Path, checks: None) -> None:
     line = f"{tmp_path}/my files/scene.xml:3: <shape>: {tmp_path}/files/scene/a.ply is gone, see https://x.org/a/b"
     shown = without_paths(line, tmp_path / "my files")
     assert shown == "scene.xml:3: <shape>: a.ply is gone, see https://x.org/a/b"

@@ -198,14 +198,20 @@ def test_files_that_must_not_be_opened_are_refused_in_a_line(session: Session, t
     assert not [row for row in other.seen if row["type"] == "NotificationShowMessage"]  # it is none of their business
 
 
-def test_a_mesh_file_becomes_the_base_of_another_round(session: Session, tabs: tuple[Tab, Tab]) -> None:
+def test_a_mesh_file_becomes_the_base_of_another_round(
+    session: Session, server: StudioServer, tabs: tuple[Tab, Tab]
+) -> None:
     one, other = tabs
+    panel = server.view.panel
+    small = panel.radii[0].max
     one.uploads("red box.glb", (ASSETS / "box.glb").read_bytes())
-    assert one.told().startswith("red_box.glb is the base now; ")
+    assert one.told() == "red_box.glb is the base now; puts the region on its head; calls it 'a red box'"
     state = session.state
     assert (state.source.round, state.prompt, list(state.regions.poses)) == (2, "a red box", ["head"])
     assert np.ptp(state.scene.base[0].vertices, axis=0) == pytest.approx([2, 2, 2])
     other.until(lambda row: row["type"] == "GlbMessage" and row["name"] == "/base")
+    assert panel.prompt.value == "a red box" and panel.region.value == "head"
+    assert panel.radii[0].max == pytest.approx(0.6 * 2) and small < 1 and panel.radii[0].value == pytest.approx(0.3)
     kept = session.work.path / "uploads" / "001" / "red_box.glb"
     assert kept.read_bytes() == (ASSETS / "box.glb").read_bytes()
     session.set_prompt("a box with a hat")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 import pytest
 from test_remesh import marched, remeshed, torus
@@ -134,6 +135,19 @@ def test_the_atlas_is_full_even_and_without_overlap(size: int) -> None:
         hit = raster.face >= 0
         assert (owner[hit] == -1).all()
         owner[hit] = number
+
+
+def test_a_surface_full_of_saddles_has_few_charts_all_the_same() -> None:
+    """A ball whose skin waves, so that many charts have to be cut before they lie flat: small ones are joined again."""
+
+    def waves(x: np.ndarray) -> np.ndarray:
+        return 0.7 - np.linalg.norm(x, axis=-1) + 0.06 * np.sin(16 * x).sum(axis=-1)
+
+    vertices, faces = marched(waves, 48)
+    solid = igl.decimate(vertices, faces, 6000)
+    mesh = unwrap(solid[0], np.asarray(solid[1], dtype=np.int64), 512)
+    chart = charts_of(mesh.faces, len(mesh.uv))
+    assert len(np.unique(chart)) <= 40
 
 
 def test_charts_that_do_not_fit_are_left_to_others() -> None:

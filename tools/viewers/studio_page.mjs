@@ -32,6 +32,8 @@ async function tab() {
 }
 
 async function picture(page, name) {
+  const notice = page.locator(".mantine-Notification-root", { hasText: "Software WebGL" });
+  if (await notice.isVisible()) await notice.locator(".mantine-Notification-closeButton").click();
   await page.screenshot({ path: join(folder, `${name}.png`), timeout: 240000 });
 }
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _PATIENCE = datetime.timedelta(days=1)
 """How long a process waits for the others: exports and pictures are made by one while the rest have nothing to do."""
 _POLITE_SECONDS = 60
-_SUMS = frozenset({"loss_sds", "guidance_loss", "part_pixels"})
+_SUMS = frozenset({"loss_sds", "guidance_loss", "guidance_critic_loss", "part_pixels"})
 _MAXIMA = frozenset({"guidance_gradient_max"})
 """How the processes' values become those of the step; all others are averaged."""
 

@@ -31,7 +31,7 @@ from fd_mitsuba.config.bounds import Weight
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.hash_grid import HashGrid
 from fd_mitsuba.fields.mlp import ColumnMlp
-from fd_mitsuba.guidance.interface import Phase
+from fd_mitsuba.guidance.interface import Guidance, Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
@@ -59,7 +59,7 @@ class DreameditorSettings(MapSettings):
     @property
     def needs(self) -> str:
         """As in `MapSettings`."""
-        return "dreameditor needs a diffusion model that sees the whole image"
+        return "dreameditor needs a diffusion model that sees one whole image"
 
 
 class MovedMesh(nn.Module):
@@ -128,6 +128,11 @@ class VertexEditStage:
         self.optimiser = adamw(mesh, self.config.geometry)
         self.counters: dict[str, int] = {}
         self._passes: dict[Phase, GeometryPass] = {}
+
+    @property
+    def guidance(self) -> Guidance | None:
+        """Our own method's; what it has learned is kept with checkpoints."""
+        return self.own.guidance
 
     @property
     def steps(self) -> int:

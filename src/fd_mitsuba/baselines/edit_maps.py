@@ -53,7 +53,7 @@ class MapSettings(Section):
     @property
     def needs(self) -> str:
         """For messages: which method needs a map, and what helps."""
-        return "the method needs a diffusion model that sees the whole image"
+        return "the method needs a diffusion model that sees one whole image"
 
 
 @dataclass(frozen=True)

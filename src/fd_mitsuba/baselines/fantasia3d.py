@@ -21,7 +21,7 @@ from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor, UnionSurface
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
-from fd_mitsuba.guidance.interface import Phase
+from fd_mitsuba.guidance.interface import Guidance, Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.training.descent import adamw, descend
@@ -64,6 +64,11 @@ class WholeObjectStage:
         self.optimiser = adamw(self.field, self.config.geometry)
         self.counters: dict[str, int] = {}
         self._passes: dict[Phase, GeometryPass] = {}
+
+    @property
+    def guidance(self) -> Guidance | None:
+        """Our own method's; what it has learned is kept with checkpoints."""
+        return self.own.guidance
 
     @property
     def steps(self) -> int:

@@ -16,7 +16,7 @@ from fd_mitsuba.baselines.editors_2d import Pix2Pix2dSettings, pix2pix_editor
 from fd_mitsuba.baselines.interface import BASELINES, EditedImages, EditTask
 from fd_mitsuba.baselines.voxels.dataset_update import DatasetUpdateStage
 from fd_mitsuba.baselines.voxels.edited import EditedVoxels
-from fd_mitsuba.baselines.voxels.fitting import VoxelFitSettings, fit_cameras, fitted_grid
+from fd_mitsuba.baselines.voxels.fitting import VoxelFitSettings, base_shown, fit_cameras, fitted_grid
 from fd_mitsuba.config.bounds import GuidanceScale, ModelName, Range, Rate, Steps, Views
 from fd_mitsuba.evaluation.judged_views import BACKGROUND
 from fd_mitsuba.render.tonemap import to_srgb
@@ -68,9 +68,10 @@ def in2n(settings: In2nSettings, task: EditTask) -> EditedVoxels:
         task,
     )
 
-    def shown(cameras: CameraBatch, size: int) -> EditedImages:
+    def lit(cameras: CameraBatch, size: int) -> EditedImages:
         return editor.base_images(cameras, size)
 
+    shown = lit if settings.model else base_shown(task.scene)
     background = float(to_srgb(torch.tensor(BACKGROUND))) if settings.model else 0.0
     kind = "colour" if settings.model else "normals"
     base, psnr = fitted_grid(settings, shown, task.config.seed, kind, background)
@@ -90,6 +91,6 @@ def in2n(settings: In2nSettings, task: EditTask) -> EditedVoxels:
         settings.noise_range,
     )
     run_stage(stage, task.folder, True, task.quiet, task.say)
-    edited = EditedVoxels(task.scene, stage.field.grid, {"fit_psnr_db": psnr}, shown if settings.model else None)
+    edited = EditedVoxels(task.scene, stage.field.grid, {"fit_psnr_db": psnr}, lit if settings.model else None)
     edited.guidance_calls = stage.steps * settings.sampling_steps
     return edited

@@ -62,7 +62,7 @@ class VoxeSettings(VoxeGlobalSettings, MapSettings):
     @property
     def needs(self) -> str:
         """As in `MapSettings`."""
-        return "voxe needs a diffusion model that sees the whole image; take voxe_global instead"
+        return "voxe needs a diffusion model that sees one whole image; take voxe_global instead"
 
 
 @BASELINES.register("voxe", VoxeSettings)

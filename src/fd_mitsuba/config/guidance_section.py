@@ -41,7 +41,7 @@ class GuidanceConfig(Section):
     controlnet_sees: Literal["depth", "normal"] = "depth"
     """What of the surface it is shown; what it was trained with."""
     variant: Choice = Choice(kind="sds")
-    """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`; `guidance.variants` has formulas and settings."""
+    """What makes the gradient: `sds`, `csd`, `ism`, `reconstruction`, `vsd`; see `guidance.variants`."""
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0

@@ -155,3 +155,23 @@ class Denoiser:
         gradient, preview = how.variant.gradient(Query(self, chunk, how))
         gradient, preview = gradient.to(chunk.z.dtype), preview.to(chunk.z.dtype)
         return gradient if chunk.mask is None else gradient * chunk.mask, preview
+
+    def teach(self, chunk: Chunk, how: Distillation, total: int) -> float:
+        """Leave the gradients of the critic's loss with its matrices; returns the loss.
+
+            1 / total sum over pictures of  mean over latents of  (mask (e_critic(z_t) - e))^2
+
+        Args:
+            chunk: with timesteps and noise of its own.
+            how: with the critic.
+            total: pictures of the step, those of other chunks and processes too.
+        """
+        assert how.critic is not None
+        query = Query(self, chunk, how)
+        z_t = query.noised(chunk.timesteps)
+        with torch.enable_grad(), how.critic.acting():
+            error = query.passes(z_t, chunk.timesteps, ("text",))["text"] - query.noise
+            error = error if chunk.mask is None else chunk.mask * error
+            loss = error.square().flatten(1).mean(dim=1).sum() / total
+            loss.backward()
+        return float(loss.detach())

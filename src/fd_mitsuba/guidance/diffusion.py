@@ -8,6 +8,7 @@ to the pictures; so the memory follows `views_per_call` in every phase, and the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.conditions import Conditions
+from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import own_device, require_device
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
@@ -32,7 +34,7 @@ from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
 from fd_mitsuba.guidance.picture_latents import PictureLatents
 from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
 from fd_mitsuba.guidance.step_draws import drawn_timesteps, own_share, step_generator
-from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation
+from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation, VariationalScore
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -62,6 +64,15 @@ class DiffusionGuidance(Denoiser):
             raise UserError(
                 f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
             )
+        self.critic: Critic | None = None
+        if isinstance(self.variant, VariationalScore):
+            own = self.variant.settings
+            if config.dtype == "float16":
+                raise UserError(
+                    "guidance.variant = vsd: what its critic learns is too small for float16; set guidance.dtype to "
+                    "bfloat16 or float32"
+                )
+            self.critic = Critic(components.unet, own.rank, own.learning_rate)
         self.view_grid = components.conventions.view_grid
         self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
@@ -163,7 +174,7 @@ class DiffusionGuidance(Denoiser):
             pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
         images, base = self._images(pictures, shown, phase)
         drawn = self._draw_for(views, step, steps_total, phase, seed)
-        return self._distil(images, base, views, phase, *drawn)
+        return self._distil(images, base, views, phase, *drawn, lesson=self._lesson(views, step, phase, seed))
 
     @network_threads()
     def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
@@ -184,7 +195,8 @@ class DiffusionGuidance(Denoiser):
             share = adaptive_avg_pool2d(part, self.latent_size)
             mask = share if self.appearance.soft_mask else (share >= MASK_THRESHOLD).to(images.dtype)
         drawn = self._draw_for(views, step, steps_total, "appearance", seed)
-        return self._distil(images, base, views, "appearance", *drawn, mask)
+        lesson = self._lesson(views, step, "appearance", seed)
+        return self._distil(images, base, views, "appearance", *drawn, mask, lesson)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
         """Scaled latents z (N, 4, L, L) of pictures or mosaics; see `PictureLatents`. Gradients flow."""
@@ -203,6 +215,7 @@ class DiffusionGuidance(Denoiser):
         timesteps: Tensor,
         noise: Tensor,
         mask: Tensor | None = None,
+        lesson: tuple[Tensor, Tensor] | None = None,
     ) -> GuidanceResult:
         self.looks_at_picture = phase == "appearance"
         how, count, (_, total) = self._how(phase), len(images), own_share(views)
@@ -221,6 +234,7 @@ class DiffusionGuidance(Denoiser):
         track = images.requires_grad and torch.is_grad_enabled()
 
         picture_gradients, latent_gradients, previews = [], [], []
+        critic_loss = 0.0
         for start in range(0, count, rows_per_chunk):
             rows = slice(start, start + rows_per_chunk)
             leaf = images[rows].detach().requires_grad_(track)
@@ -240,6 +254,9 @@ class DiffusionGuidance(Denoiser):
                 cameras=None if cameras is None else cameras[rows],
             )
             gradient, preview = self.latent_gradient(chunk, how)
+            if self.critic is not None and lesson is not None and track:
+                asked = replace(chunk, timesteps=lesson[0][rows], noise=lesson[1][rows])
+                critic_loss += self.teach(asked, how, total)
             self._check_finite(gradient, chunk.timesteps, "latents")
             if track:
                 picture_gradients.append(torch.autograd.grad(z, leaf, gradient)[0])
@@ -247,6 +264,8 @@ class DiffusionGuidance(Denoiser):
             latent_gradients.append(gradient)
             previews.append(preview)
 
+        if self.critic is not None and lesson is not None and track:
+            self.critic.take_step()
         gradient = torch.cat(latent_gradients)
         # The way back to the pictures is linear, so that it may be scaled at its end, when all chunks are known.
         scale = 1 / total if self.config.reduction == "mean" else 1.0
@@ -263,6 +282,8 @@ class DiffusionGuidance(Denoiser):
             "guidance_gradient_max": float(gradient.abs().max()),
             "guidance_timestep": float(timesteps.float().mean()),
         }
+        if self.critic is not None:
+            logs["guidance_critic_loss"] = critic_loss
         return GuidanceResult(loss=loss, logs=logs, preview=torch.cat(previews))
 
     def _how(self, phase: Phase) -> Distillation:
@@ -278,6 +299,7 @@ class DiffusionGuidance(Denoiser):
             settings.image_guidance_scale,
             bounds,
             self.config.perp_neg,
+            self.critic,
         )
 
     def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
@@ -339,6 +361,35 @@ class DiffusionGuidance(Denoiser):
         timesteps = timesteps.repeat_interleave(self.views_together)
         noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
         return timesteps.to(self.device), noise.to(self.device)
+
+    def _lesson(
+        self, views: GuidanceViews | AppearanceViews, step: int, phase: Phase, seed: int
+    ) -> tuple[Tensor, Tensor] | None:
+        """Timesteps, from the whole range, and noise of these views for the critic; None without one.
+
+        It starts anew with a phase, whose latents are of another kind.
+        """
+        if self.critic is None:
+            return None
+        if step == 0:
+            self.critic.reset()
+        generator = step_generator(seed, step, phase, 2)
+        share, total = own_share(views)
+        grid, together = self.view_grid**2, self.views_together
+        count = total // grid
+        timesteps = torch.randint(1, len(self.alpha_bars), (count // together,), generator=generator)
+        noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
+        own = slice(share.start // grid, share.stop // grid)
+        return timesteps.repeat_interleave(together)[own].to(self.device), noise[own].to(self.device)
+
+    def learned_state(self) -> dict[str, Tensor]:
+        """What was learned from step to step, for a checkpoint; empty but for the variant `vsd`."""
+        return {} if self.critic is None else self.critic.state()
+
+    def load_learned_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from a `learned_state`. Raises ValueError where it is of another model."""
+        if self.critic is not None:
+            self.critic.load_state(state)
 
     def _check_finite(self, gradient: Tensor, timesteps: Tensor, where: str) -> None:
         bad = ~gradient.isfinite().flatten(1).all(1)

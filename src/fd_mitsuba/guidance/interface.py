@@ -119,6 +119,8 @@ class Guidance(Protocol):
     prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
     Optional, for models that see several views at once: `views_together`, of which the number of views must be a
     multiple. They are consecutive, share elevation and distance, and are evenly spread around the object.
+    Optional, for what learns from step to step: `learned_state()`, tensors by name, which checkpoints hold, and
+    `load_learned_state(tensors)`, ValueError where they do not fit.
 
     Properties here may be plain attributes of a class: nothing writes to them.
     """

@@ -24,6 +24,7 @@ from fd_mitsuba.config import Section
 from fd_mitsuba.config.registry import Registry
 from fd_mitsuba.conventions import Weighting
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.critic import Critic
 
 Pass = Literal["guided", "text", "free"]
 
@@ -34,10 +35,12 @@ class Variant(ABC):
     Attributes:
         passes: the network's passes that `gradient` asks for: `guided` (those of classifier-free guidance), `text`,
             `free` (that without the prompt).
+        learns: there is a `Query.critic`, which learns what the latents are like.
         settings: its own, as the registry has checked them.
     """
 
     passes: ClassVar[tuple[Pass, ...]] = ("guided",)
+    learns: ClassVar[bool] = False
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
@@ -61,6 +64,8 @@ class Distillation:
     image_guidance_scale: float
     timestep_range: tuple[float, float]
     perp_neg: float = 0.0
+    critic: Critic | None = None
+    """For a variant that `learns`."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,12 @@ class Query:
         away = sds.perpendicular(seen["negative"] - free, seen["text"] - free)
         return noise_hat - how.guidance_scale * how.perp_neg * away
 
+    def criticised(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
+        """The noise that the critic sees with the prompt."""
+        assert self.how.critic is not None
+        with self.how.critic.acting():
+            return self.passes(z_t, timesteps, ("text",))["text"]
+
     def move(self, z_t: Tensor, noise_hat: Tensor, now: Tensor, to: Tensor) -> Tensor:
         """A DDIM step to the levels `to`, up or down. Outside the mask z stays what it is, without noise."""
         moved = sds.ddim_step(z_t, noise_hat, self.alpha_bar(now), self.alpha_bar(to))
@@ -282,6 +293,36 @@ class Reconstruction(Variant):
             noise_hat = query.guided(z_t, now)
         z_hat = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(now))
         return sds.reconstruction_gradient(query.chunk.z, z_hat, query.weights()), z_hat
+
+
+class VariationalSettings(Section):
+    """Of `vsd`."""
+
+    rank: Annotated[int, Field(ge=1, le=64)] = 4
+    """Of the critic's change of each matrix."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-4
+    """Of the critic."""
+
+
+@VARIANTS.register("vsd", VariationalSettings)
+class VariationalScore(Variant):
+    """g = w(t) (e_hat(z_t) - e_critic(z_t)): VSD (ProlificDreamer, arXiv 2305.16213).
+
+    e_critic is the network with a LoRA that learns, one step after each, to see the noise in the step's own latents at
+    timesteps from the whole range. It reads the prompt, with the word for the view, where ProlificDreamer tells it the
+    camera; it starts anew in each phase.
+    """
+
+    passes = ("guided", "text")
+    learns = True
+    settings: VariationalSettings
+
+    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
+        timesteps = query.chunk.timesteps
+        z_t = query.noised(timesteps)
+        noise_hat = query.guided(z_t, timesteps)
+        preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
+        return sds.sds_gradient(noise_hat, query.criticised(z_t, timesteps), query.weights()), preview
 
 
 def free_pass(has_image_pass: bool) -> str:

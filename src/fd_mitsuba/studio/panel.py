@@ -92,13 +92,8 @@ class Panel:
             "Its prompt", "", hint="what this part alone shall be, as in 'a hat'; blank: the prompt above says it"
         )
         self.centre = self._gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=1e-3)
-        longest = BASE_LONGEST_SIDE / state.regions.frame.scale
-        self.radii = [
-            self._gui.add_slider(
-                f"Radius {axis}", _even(longest / 200), _even(longest * 0.6), longest / 1e4, longest / 10
-            )
-            for axis in "xyz"
-        ]
+        low, high, step = _range_of_radii(state.regions.frame.scale)
+        self.radii = [self._gui.add_slider(f"Radius {axis}", low, high, step, high / 6) for axis in "xyz"]
         for field in (self.part, self.part_prompt, self.centre, *self.radii):
             field.on_update(self._heard(lambda event: self._field_changed()))
         self.place_buttons = self._gui.add_button_group("Region", tuple(_REGION_BUTTONS))
@@ -135,8 +130,12 @@ class Panel:
             self.session.put(replace(named, centre=centre, radii=radii))
 
     def show_regions(self) -> None:
-        """Names and the selected region's numbers."""
+        """Names and the selected region's numbers; another base has another range of radii."""
         state = self.session.state
+        low, high, step = _range_of_radii(state.regions.frame.scale)
+        for slider in self.radii:
+            if (slider.min, slider.step) != (low, step):
+                slider.min, slider.max, slider.step = low, high, step
         names = list(state.regions.poses) or ["-"]
         if tuple(names) != tuple(self.region.options):
             self.region.options = names
@@ -170,6 +169,12 @@ class Panel:
         lines += [f"- **Warning:** {escaped(plain(line))}" for line in check.warnings]
         self.check.content = "\n".join(lines) or "-"
         self.runs.show_check(check)
+
+
+def _range_of_radii(scale: float) -> tuple[float, float, float]:
+    """Least, most and step of a radius in user units, for a base that is so much smaller in the canonical frame."""
+    longest = BASE_LONGEST_SIDE / scale
+    return _even(longest / 200), _even(longest * 0.6), longest / 1e4
 
 
 def _even(value: float) -> float:

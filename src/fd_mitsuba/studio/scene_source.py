@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -141,4 +142,6 @@ class SceneSource:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        return SceneSource(self.work, made.scene, made.scene, self.first, {}, number), [*made.remarks, *made.notes]
+        # What a guess is followed by is how the command line says otherwise; the page has fields for that.
+        guesses = [re.split("; (?:--|give )", line)[0] for line in made.remarks]
+        return SceneSource(self.work, made.scene, made.scene, self.first, {}, number), [*guesses, *made.notes]

@@ -98,7 +98,7 @@ class View:
             canvas.place_region(pose, frame)
             canvas.show_gizmo(pose, frame)
             panel.show_pose(pose)
-        if topic == "prompt":
+        if topic in ("scene", "prompt"):
             panel.show_prompt()
         if topic == "settings":
             panel.runs.show_settings()

@@ -51,11 +51,19 @@ def checkpoint_path(folder: Path, step: int) -> Path:
 
 
 def save_checkpoint(
-    folder: Path, header: CheckpointHeader, field: nn.Module, optimiser: torch.optim.Optimizer, keep: int
+    folder: Path,
+    header: CheckpointHeader,
+    field: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    keep: int,
+    guidance: Any = None,
 ) -> Path:
     """Write a checkpoint so that it is there whole or not at all, then remove all but the newest `keep`.
 
     Files of later steps go as well: `load_newest` passed over them as damaged, and they would push out good ones.
+
+    Args:
+        guidance: whose `learned_state`, where it has one, is kept too.
 
     Raises:
         UserError: the folder cannot be written (full, read-only).
@@ -64,6 +72,8 @@ def save_checkpoint(
     for index, state in optimiser.state_dict()["state"].items():
         for name, value in state.items():
             tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value).contiguous()
+    if hasattr(guidance, "learned_state"):
+        tensors |= {f"guidance.{name}": value for name, value in guidance.learned_state().items()}
     text = json.dumps({**vars(header), "sha256": _digest(tensors)}, sort_keys=True)
     path = checkpoint_path(folder, header.step)
     write_atomically(path, save(tensors, metadata={_HEADER_KEY: text}))
@@ -87,8 +97,12 @@ def load_newest(
     field: nn.Module,
     optimiser: torch.optim.Optimizer,
     counters: dict[str, int] | None = None,
+    guidance: Any = None,
 ) -> tuple[int, list[str]]:
     """Load the newest whole checkpoint into the field and the optimiser, and its counters into `counters` if given.
+
+    Args:
+        guidance: gets back what `save_checkpoint` has kept of it.
 
     Returns:
         The number of finished steps (0 without a checkpoint), and a line for each damaged file that was passed over.
@@ -110,6 +124,7 @@ def load_newest(
             remarks.append(f"{path}: damaged checkpoint passed over (its tensors do not fit their hash)")
             continue
         _apply(path, tensors, field, optimiser)
+        _teach(path, tensors, guidance)
         if counters is not None:
             counters.update(header.get("counters", {}))
         return int(header["step"]), remarks
@@ -130,6 +145,15 @@ def load_trained(run: Path, stage: Stage, config_hash: str) -> bool:
         newest = remarks[0].removeprefix(f"{folder}/") if remarks else ""
         raise UserError(f"{folder}: every checkpoint is damaged ({newest}); run the {stage.name} stage again")
     return True
+
+
+def _teach(path: Path, tensors: dict[str, Tensor], guidance: Any) -> None:
+    learned = {name[9:]: value for name, value in tensors.items() if name.startswith("guidance.")}
+    if learned and hasattr(guidance, "load_learned_state"):
+        try:
+            guidance.load_learned_state(learned)
+        except ValueError as error:
+            raise UserError(f"{path}: {error}; choose another -o folder") from None
 
 
 def _digest(tensors: dict[str, Tensor]) -> str:

@@ -40,16 +40,17 @@ def run_stage(
     """
     config, checkpoints = stage.config, checkpoint_folder(folder, stage.name)
     config_hash, total = config.content_hash(stage.name), stage.steps
-    done = 0
+    done, guidance = 0, getattr(stage, "guidance", None)
     if resume:
-        done, remarks = load_newest(checkpoints, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
+        own = stage.field, stage.optimiser, stage.counters, guidance
+        done, remarks = load_newest(checkpoints, stage.name, config_hash, *own)
         for remark in remarks:
             say(remark)
         say(f"resuming after step {done} of {total}" if done else "no checkpoint yet: starting at step 0")
 
     def save(step: int) -> None:
         header = CheckpointHeader(stage.name, step, config_hash, counters=dict(stage.counters))
-        save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept)
+        save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept, guidance)
 
     group = processes()
     recording = Recorder(folder, stage.name, total, done, quiet) if group.writes else nullcontext()

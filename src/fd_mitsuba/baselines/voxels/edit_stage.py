@@ -16,6 +16,7 @@ from torch import Tensor
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid
 from fd_mitsuba.baselines.voxels.rendering import render_normals
 from fd_mitsuba.errors import RunStopped
+from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.training.descent import descend
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.seeds import Purpose, seed_for
@@ -56,6 +57,11 @@ class VoxelEditStage:
         self.field.load_state_dict(base.state_dict())
         self.optimiser = torch.optim.Adam(self.field.parameters(), lr=learning_rate, eps=1e-15)
         self.counters: dict[str, int] = {}
+
+    @property
+    def guidance(self) -> Guidance | None:
+        """Our own method's; what it has learned is kept with checkpoints."""
+        return self.own.guidance
 
     @property
     def steps(self) -> int:

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 _CELLS = 256
-_STARTS_AT, _STEP, _TRIES = 0.74, 0.975, 14
+_STARTS_AT, _STEP, _TRIES = 0.745, 0.95, 8
 """The share of the square that is tried first, what a try that does not fit is scaled by, and how often."""
+_FINE_STEP, _MORE_TRIES, _ORDERS = 0.98, 3, 3
+"""What has fitted is scaled up by, how often, and in how many orders the charts are laid for it."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +45,31 @@ def packed_charts(
     of_face = chart[faces[:, 0]]
     area = np.bincount(of_face, areas)
     scale = cells * np.sqrt(_STARTS_AT / max(areas.sum(), 1e-30))
-    for _ in range(_TRIES):
+
+    def laid(scale: float, orders: int) -> np.ndarray | None:
         shapes = _shapes(flat * scale, faces, of_face, len(area), gutter)
-        places = _laid_in_some_order(shapes, area, cells)
-        if places is not None:
-            made = np.empty_like(flat)
-            for number, (quarter, at) in enumerate(places):
-                own = chart == number
-                made[own] = _turned(flat[own] * scale - shapes[number].low, shapes[number].mask.shape, quarter) + at
-            return made / cells
+        places = _laid_in_some_order(shapes, area, cells, orders)
+        if places is None:
+            return None
+        made = np.empty_like(flat)
+        for number, (quarter, at) in enumerate(places):
+            own = chart == number
+            made[own] = _turned(flat[own] * scale - shapes[number].low, shapes[number].mask.shape, quarter) + at
+        return made / cells
+
+    best = None
+    for _ in range(_TRIES):
+        best = laid(scale, 1)
+        if best is not None:
+            break
         scale *= np.sqrt(_STEP)
-    return None
+    for _ in range(_MORE_TRIES if best is not None else 0):
+        scale /= np.sqrt(_FINE_STEP)
+        larger = laid(scale, _ORDERS)
+        if larger is None:
+            break
+        best = larger
+    return best
 
 
 def _shapes(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray, count: int, gutter: float) -> list[_Shape]:
@@ -92,10 +108,12 @@ def _covering(flat: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> tuple
     return np.concatenate(points), np.concatenate(owners)
 
 
-def _laid_in_some_order(shapes: list[_Shape], area: np.ndarray, cells: int) -> list[tuple[int, np.ndarray]] | None:
+def _laid_in_some_order(
+    shapes: list[_Shape], area: np.ndarray, cells: int, orders: int
+) -> list[tuple[int, np.ndarray]] | None:
     """As `_laid`, the largest charts first, or else the longest, or those that take up the largest rectangles."""
     sides = np.array([shape.mask.shape for shape in shapes])
-    for size in (area, sides.max(axis=1), sides.prod(axis=1)):
+    for size in (area, sides.max(axis=1), sides.prod(axis=1))[:orders]:
         places = _laid(shapes, np.argsort(-size, kind="stable"), cells)
         if places is not None:
             return places

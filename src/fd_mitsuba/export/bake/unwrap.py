@@ -1,6 +1,7 @@
 """A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart.
 
-    charts    `grown_charts` (few, wide) or xatlas (any mesh)     which faces lie together, and where the seams are
+    charts    `grown_charts` (few, wide) or xatlas (any mesh)     which faces lie together, and where the seams are;
+              `split_chart`, `_joined`                            of the wide ones, until all lie flat and are few
     flat      `flattened`, or xatlas                              each chart laid flat, in the mesh's own unit
     notches   `open_notches`, `crowded`                           places where a texel would belong to two of its faces
     packed    `packed_charts` (few), or xatlas                    all charts in the unit square, with gutters
@@ -22,7 +23,7 @@ from fd_mitsuba.export.bake.chart_growth import grown_charts, split_chart
 from fd_mitsuba.export.bake.chart_notches import charts_of, crowded, open_notches
 from fd_mitsuba.export.bake.chart_packing import packed_charts
 from fd_mitsuba.export.bake.flatten import NotFlat, flattened, pinched_apart
-from fd_mitsuba.export.final_surface.mesh_rings import edges_of
+from fd_mitsuba.export.final_surface.mesh_rings import Edges, edges_of
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FACES_AT_ONCE = 2500
@@ -31,6 +32,8 @@ _FEWEST = 400
 """Faces that a mesh must have for charts of our own."""
 _ROUNDS, _TRIES = 3, 40
 """How often charts with narrow notches are cut in two, and how many may not lie flat before all is left to xatlas."""
+_WANTED, _NEIGHBOURS = 36, 3
+"""With more charts than that, the smallest are joined to one of so many neighbours, where that lies flat."""
 _FEW_CHARTS = 100
 """So many charts are laid one by one; more would take too long."""
 _PACKINGS = 6
@@ -105,11 +108,9 @@ def _wide_charts(
     except ValueError:
         return None
     chart = grown_charts(vertices, faces, edges)
-    laid: dict[
-        int, tuple[np.ndarray, ...]
-    ] = {}  # its faces, their corners in its own vertices, which those are, places
+    laid: dict[int, tuple[np.ndarray, ...]] = {}  # its faces, the same in its own vertices, which these are, places
     tries, found = 0, None
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         waiting = [number for number in np.unique(chart).tolist() if number not in laid]
         while waiting:
             number = waiting.pop()
@@ -126,14 +127,48 @@ def _wide_charts(
                 chart = split_chart(vertices, faces, edges, chart, number, apart)
         vertex_map, split, flat = found = _side_by_side(faces, laid)
         narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
+        if not len(narrow) or turn == _ROUNDS - 1:
+            break
         for one, other in narrow.tolist():
             number = int(chart[one])
             if number in laid and chart[other] == number:  # of each chart the worst place first
                 chart = split_chart(vertices, faces, edges, chart, number, (one, other))
                 del laid[number]
-        if not len(narrow):
-            break
+    if found is not None and len(laid) > _WANTED:
+        density = _likely_density(found[2], found[1], texture_size)
+        found = _side_by_side(faces, _joined(vertices, faces, edges, chart, laid, density))
     return found
+
+
+def _joined(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    edges: Edges,
+    chart: np.ndarray,
+    laid: dict[int, tuple[np.ndarray, ...]],
+    density: float,
+) -> dict[int, tuple[np.ndarray, ...]]:
+    """The charts with small ones joined to a neighbour where both lie flat together, until few enough are left."""
+    chart, laid = chart.copy(), dict(laid)
+    for number in sorted(laid, key=lambda x: len(laid[x][0])):
+        if len(laid) <= _WANTED:
+            break
+        near = chart[edges.faces]
+        across = (near == number).sum(axis=1) == 1
+        others, border = np.unique(near[across].sum(axis=1) - number, return_counts=True)
+        for other in others[np.argsort(-border, kind="stable")][:_NEIGHBOURS].tolist():
+            own = np.flatnonzero((chart == number) | (chart == other))
+            local, used = pinched_apart(faces[own])
+            try:
+                flat = flattened(vertices[used], local)
+            except NotFlat:
+                continue
+            if not len(crowded(vertices[used], local, flat, density)):
+                laid[other] = own, local, used, flat
+                chart[own] = other
+                del laid[number]
+                break
+    return laid
 
 
 def _side_by_side(

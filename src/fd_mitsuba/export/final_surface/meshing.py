@@ -23,7 +23,7 @@ _THINNED, _WORTH_THINNING = 1.4, 1.3
 """How many times the triangles aimed at remeshing starts from, and how many times more there must be for that."""
 _TRIES = 3
 """Times that the edge is lengthened if there are still more faces than wanted."""
-_RIM_ROUNDS = 3
+_ROUNDS, _RIM_ROUNDS = 4, 3
 _LEAST_ANGLE_DEG = 12.0
 _LEAST_AT_RIM_DEG = 6.0
 _MAY_MOVE_CELLS = 0.05
@@ -71,7 +71,7 @@ def evenly_meshed(
         return remesh(vertices, triangles, edge, onto, rounds)
 
     vertices, triangles = _thinned(vertices, triangles, round(_THINNED * _MESHED * faces))
-    vertices, triangles = remeshed(vertices, triangles, edge, 6)
+    vertices, triangles = remeshed(vertices, triangles, edge, _ROUNDS)
     for _ in range(_TRIES):
         if len(triangles) <= faces:
             break
@@ -94,13 +94,13 @@ def _thinned(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[n
     """
     if len(triangles) < _WORTH_THINNING * count:
         return vertices, triangles
-    fewer, left, _, _ = igl.decimate(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), count)
-    left = np.asarray(left, dtype=np.int64)
+    made = igl.decimate(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), count)
+    fewer, left = np.asarray(made[0], dtype=np.float64), np.asarray(made[1], dtype=np.int64)
     try:
         edges_of(left, len(fewer))
     except ValueError:
         return vertices, triangles
-    return np.asarray(fewer, dtype=np.float64), left
+    return fewer, left
 
 
 def _closely(

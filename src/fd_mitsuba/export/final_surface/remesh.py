@@ -28,6 +28,8 @@ Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 _LONG, _SHORT = 4 / 3, 4 / 5
 _FAR_SHORTER = 0.35
 _TIDYINGS = 10
+_FEW = 0.002
+"""Share of the vertices: where fewer go, the next round may as well begin."""
 _TURNED = 0.35
 """A collapse or flip may turn a face's normal by at most the angle with this cosine."""
 _THIN = 0.05
@@ -53,8 +55,9 @@ def remesh(
         if long.any():
             vertices, faces = halved(vertices, faces, edges, long)
         for _ in range(16 if number == 0 else 6):
-            vertices, faces, changed = _collapse(vertices, faces, edge, rng)
-            if not changed:
+            count = len(vertices)
+            vertices, faces = _collapse(vertices, faces, edge, rng)
+            if count - len(vertices) < _FEW * count:
                 break
         for _ in range(3):
             faces, changed = _flip(vertices, faces, rng)
@@ -72,9 +75,10 @@ def tidied(vertices: np.ndarray, faces: np.ndarray, edge: float) -> tuple[np.nda
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     rng = np.random.default_rng(0)
     for _ in range(_TIDYINGS):
-        vertices, faces, collapsed = _collapse(vertices, faces, edge, rng, _FAR_SHORTER)
+        count = len(vertices)
+        vertices, faces = _collapse(vertices, faces, edge, rng, _FAR_SHORTER)
         faces, flipped = _flip(vertices, faces, rng)
-        if not (collapsed or flipped):
+        if len(vertices) == count and not flipped:
             break
     return vertices, faces
 
@@ -130,13 +134,13 @@ def halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, long: np.ndarr
 
 def _collapse(
     vertices: np.ndarray, faces: np.ndarray, edge: float, rng: np.random.Generator, share: float = _SHORT
-) -> tuple[np.ndarray, np.ndarray, bool]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Some of the short edges shrunk to their middles, where that leaves a closed surface of the same kind."""
     count = len(vertices)
     edges = edges_of(faces, count)
     short = np.flatnonzero(_lengths(vertices, edges.ends) < share * edge)
     if not len(short):
-        return vertices, faces, False
+        return vertices, faces
     ends, opposite = edges.ends[short], edges.opposite[short]
     rank = rng.permutation(len(short))
     of_face = _least(_lowest(ends, rank, count)[faces])
@@ -154,7 +158,7 @@ def _collapse(
     good &= _may_move(vertices, faces, ends, edge)
     ends = ends[good]
     if not len(ends):
-        return vertices, faces, len(good) > 0
+        return vertices, faces
     middle = vertices[ends].mean(axis=1)
     keep, gone = ends.T
     vertices = vertices.copy()
@@ -166,7 +170,7 @@ def _collapse(
     faces = faces[(a != b) & (b != c) & (c != a)]
     used = np.ones(count, dtype=bool)
     used[gone] = False
-    return vertices[used], (np.cumsum(used) - 1)[faces], True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
 
 
 def _may_move(vertices: np.ndarray, faces: np.ndarray, ends: np.ndarray, edge: float) -> np.ndarray:
