@@ -128,7 +128,7 @@ def train_part_judge(folder: Path, kind: JudgeKind, seconds: float, steps: int |
     """
     total, started = steps or kind.steps, time.monotonic()
     torch.manual_seed(0)
-    network = PartNetwork(kind.classes).to(memory_format=torch.channels_last)
+    network = PartNetwork(kind.classes).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, weight_decay=0.02, fused=True)
     average = {key: value.clone() for key, value in network.state_dict().items() if value.is_floating_point()}
     step = 0
