@@ -17,7 +17,7 @@ def add_check_command(commands: argparse._SubParsersAction) -> None:
     scene_options(check)
     settings_options(check)
     check.add_argument("--json", action="store_true", help="machine-readable")
-    check.set_defaults(call=_check)
+    check.set_defaults(call=_check, writes_nothing=True)
 
 
 @uncollected()  # most of a check is imports
