@@ -1,8 +1,8 @@
 """How much memory a run will take at its peak: what a run takes in any case, and what each input adds.
 
-The numbers are differences of measured peaks (resident set, 2 cores, `configs/quick.toml`, the cat): 1.63 GB as it is
-shipped; 3.54 GB with 2.0 million faces, 5.29 GB under a light of 8192 x 4096 pixels, 3.52 GB with textures of 4096 x
-4096, 4.31 GB with baked textures of that size, 1.82 GB on a grid of 128 cells a side.
+The numbers are differences of measured peaks (resident set, 2 cores, `configs/quick.toml`, the cat): 1.80 GB as it is
+shipped; 2.34 GB with 1.1 million faces and 3.54 with 2.0, 5.3 to 6.5 GB under a light of 8192 x 4096 pixels, 3.24 GB
+with textures of 4096 x 4096, 4.31 GB with baked textures of that size, 1.82 GB on a grid of 128 cells a side.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _MIB = 2.0**20
 _IMPORTS, _BUILTIN = 390.0, 200.0
 _SHAPE, _MATERIAL = 390.0, 370.0
 """What the geometry stage with its exports, and then the appearance stage with its own, add in any case."""
-_PER_FACE = {"check": 830.0, "run": 990.0}
-_PER_LIGHT_PIXEL = {"check": 70.0, "run": 112.0}
+_PER_FACE = {"check": 830.0, "run": 740.0}
+_PER_LIGHT_PIXEL = {"check": 70.0, "run": 125.0}
 _PER_HELD_LIGHT_PIXEL = 41.0
 _PER_TEXTURE_VALUE = {"check": 3.0, "run": 29.0}
 _PER_GRID_VERTEX = 165.0
