@@ -39,6 +39,9 @@ _CONTROLNET = 0.42
 _SECONDS_PER_MILLION_FACES = 20.0
 """In each stage: search trees, signs of the grid, meshes to write."""
 _SECONDS_PER_MILLION_LIGHT_PIXELS = 0.5
+_SECONDS_PER_MILLION_TEXELS = 3.5
+_USUAL_TEXELS = 512**2
+"""Of a baked texture; so many are in the seconds above."""
 
 _FINER = 2.2
 """How many times as long the fine prior takes for a view."""
@@ -133,6 +136,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     lit = _appearance_step(scene, config, encoder if builtin else forward, encoder, slower)
     once = LIT_PICTURES_SECONDS + _photographs(config.output.picture_size)
     once += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
+    once += _SECONDS_PER_MILLION_TEXELS * max(config.output.texture_size**2 - _USUAL_TEXELS, 0) / 1e6
     lit_total = lit * config.appearance.steps + slower * once
     if left_out:
         lit = lit_total = 0.0
