@@ -98,7 +98,11 @@ try {
     said.before = await page.evaluate(() => document.body.innerText);
     await page.getByRole("button", { name: "Resume" }).click();
     if (options.learning) { // a step of the material from which on to take a picture
-      await page.getByText(new RegExp(`appearance, step ${options.learning}`)).waitFor({ timeout: options.patience ?? 600000 });
+      // Steps come by faster than the page is drawn: a later one will do.
+      await page.waitForFunction((from) => {
+        const step = /appearance, step (\d+)/.exec(document.body.innerText);
+        return (step && Number(step[1]) >= from) || /^finished$/m.test(document.body.innerText);
+      }, options.learning, { timeout: options.patience ?? 600000 });
       await picture(page, "learning");
     }
     await page.getByText("finished", { exact: true }).waitFor({ timeout: options.patience ?? 600000 });
