@@ -50,16 +50,6 @@ class JudgedViews:
     untouched: Tensor
 
 
-@dataclass(frozen=True)
-class ShapePictures:
-    """N views of a bare shape: (N, 3, S, S) each, and (N,) how many pixels of the edited one show the part."""
-
-    edited: Tensor
-    base: Tensor
-    start: Tensor
-    part_pixels: Tensor
-
-
 def judged_cameras(count: int, aim: np.ndarray) -> CameraBatch:
     """The evaluation's ring: elevation 45 degrees, evenly spread, front first.
 
@@ -110,14 +100,6 @@ def shape_views(stage: GeometryStage, count: int, size: int, spp: int, kind: Kin
     whole = (edited[:, 3:4] > 0.999) & (base[:, 3:4] > 0.999) & (edited[:, 4:5] == 0)
     colours = {name: coloured(picture, kind) for name, picture in shown.items()}
     return JudgedViews(kind, cameras.azimuth_deg, **colours, base_pixels=whole, untouched=whole)
-
-
-@torch.no_grad()
-def shape_pictures(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int, kind: Kind) -> ShapePictures:
-    """The same from other cameras, for judges alone."""
-    shown = _shapes(stage, cameras, size, spp)
-    colours = {name: coloured(picture, kind) for name, picture in shown.items()}
-    return ShapePictures(**colours, part_pixels=shown["edited"][:, 4].sum((1, 2)))
 
 
 def _shapes(stage: GeometryStage, cameras: CameraBatch, size: int, spp: int) -> dict[str, Tensor]:
