@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from fd_mitsuba.baselines.edit_maps import MapSettings, edit_maps, map_source
 from fd_mitsuba.baselines.fantasia3d import surface_error
+from fd_mitsuba.baselines.guided_stage import GuidedStage
 from fd_mitsuba.baselines.interface import BASELINES, EditedMesh, EditTask, mesh_images, to_world_space
 from fd_mitsuba.baselines.vertex_map import vertex_values
 from fd_mitsuba.baselines.voxels.fitting import fit_cameras
@@ -31,7 +32,7 @@ from fd_mitsuba.config.bounds import Weight
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.hash_grid import HashGrid
 from fd_mitsuba.fields.mlp import ColumnMlp
-from fd_mitsuba.guidance.interface import Guidance, Phase
+from fd_mitsuba.guidance.interface import Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend
@@ -112,7 +113,7 @@ class MovedMesh(nn.Module):
         return (apart.square().sum(dim=1) / self._length.square()).mean()
 
 
-class VertexEditStage:
+class VertexEditStage(GuidedStage):
     """A stage whose field is a `MovedMesh`; see `training.stage.Stage`.
 
     Args:
@@ -121,27 +122,11 @@ class VertexEditStage:
         lambda_smooth: weight of `MovedMesh.loss_smooth`.
     """
 
-    name = "geometry"
-
     def __init__(self, own: GeometryStage, mesh: MovedMesh, lambda_smooth: float) -> None:
-        self.own, self.config, self.field, self._lambda = own, own.config, mesh, lambda_smooth
+        super().__init__(own)
+        self.field, self._lambda = mesh, lambda_smooth
         self.optimiser = adamw(mesh, self.config.geometry)
-        self.counters: dict[str, int] = {}
         self._passes: dict[Phase, GeometryPass] = {}
-
-    @property
-    def guidance(self) -> Guidance | None:
-        """Our own method's; what it has learned is kept with checkpoints."""
-        return self.own.guidance
-
-    @property
-    def steps(self) -> int:
-        """As many as our own method's geometry stage has."""
-        return self.own.steps
-
-    def phase_name(self, step: int) -> str:
-        """`coarse` or `refined`, as in our own method."""
-        return self.own.phase_name(step)
 
     def step(self, step: int) -> StepRecord:
         """Run step `step` and move the vertices once; RunStopped if a number is not finite."""

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.baselines.guided_stage import GuidedStage
 from fd_mitsuba.baselines.interface import BASELINES, EditedMesh, EditTask
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import Weight
@@ -21,7 +22,7 @@ from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor, UnionSurface
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
-from fd_mitsuba.guidance.interface import Guidance, Phase
+from fd_mitsuba.guidance.interface import Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.training.descent import adamw, descend
@@ -40,7 +41,7 @@ class Fantasia3dSettings(Section):
     original."""
 
 
-class WholeObjectStage:
+class WholeObjectStage(GuidedStage):
     """A stage whose field is the whole object; see `training.stage.Stage`.
 
     Args:
@@ -48,10 +49,9 @@ class WholeObjectStage:
         settings: the method's own.
     """
 
-    name = "geometry"
-
     def __init__(self, own: GeometryStage, settings: Fantasia3dSettings) -> None:
-        self.own, self.config, self._settings = own, own.config, settings
+        super().__init__(own)
+        self._settings = settings
         grid, count = own.grid, own.grid.count
         self.extractor = SurfaceExtractor(
             grid,
@@ -62,22 +62,7 @@ class WholeObjectStage:
         )
         self.field = PartField(self.config.field, seed_for(self.config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, self.config.geometry)
-        self.counters: dict[str, int] = {}
         self._passes: dict[Phase, GeometryPass] = {}
-
-    @property
-    def guidance(self) -> Guidance | None:
-        """Our own method's; what it has learned is kept with checkpoints."""
-        return self.own.guidance
-
-    @property
-    def steps(self) -> int:
-        """As many as our own method's geometry stage has."""
-        return self.own.steps
-
-    def phase_name(self, step: int) -> str:
-        """`coarse` or `refined`, as in our own method."""
-        return self.own.phase_name(step)
 
     def surface(self) -> UnionSurface:
         """The object's surface; gradients flow to the field."""

@@ -13,10 +13,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from fd_mitsuba.baselines.guided_stage import GuidedStage
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid
 from fd_mitsuba.baselines.voxels.rendering import render_normals
 from fd_mitsuba.errors import RunStopped
-from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.training.descent import descend
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.seeds import Purpose, seed_for
@@ -34,7 +34,7 @@ def loss_correlation(density: Tensor, base: Tensor) -> Tensor:
     return 1 - (one * other).mean() / (one.square().mean() * other.square().mean()).sqrt().clamp(min=1e-12)
 
 
-class VoxelEditStage:
+class VoxelEditStage(GuidedStage):
     """A stage whose field is a voxel grid; see `training.stage.Stage`.
 
     Args:
@@ -45,32 +45,15 @@ class VoxelEditStage:
         lambda_correlation: weight of `loss_correlation`.
     """
 
-    name = "geometry"
-
     def __init__(
         self, own: GeometryStage, base: VoxelGrid, samples: int, learning_rate: float, lambda_correlation: float
     ) -> None:
-        self.own, self.config = own, own.config
+        super().__init__(own)
         self._samples, self._learning_rate, self._lambda = samples, learning_rate, lambda_correlation
         self._base = base.density.detach().clone()
         self.field = VoxelGrid(base.resolution, len(base.features), base.half_extent)
         self.field.load_state_dict(base.state_dict())
         self.optimiser = torch.optim.Adam(self.field.parameters(), lr=learning_rate, eps=1e-15)
-        self.counters: dict[str, int] = {}
-
-    @property
-    def guidance(self) -> Guidance | None:
-        """Our own method's; what it has learned is kept with checkpoints."""
-        return self.own.guidance
-
-    @property
-    def steps(self) -> int:
-        """As many as our own method's geometry stage has."""
-        return self.own.steps
-
-    def phase_name(self, step: int) -> str:
-        """`coarse` or `refined`, as in our own method."""
-        return self.own.phase_name(step)
 
     def step(self, step: int) -> StepRecord:
         """Run step `step` and change the grid once; RunStopped if a number is not finite."""
