@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from pathlib import Path
 
 from fd_mitsuba.errors import UserError
@@ -13,7 +14,8 @@ _LITTER = ".tmp"
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write bytes to a neighbouring file, flush it to the disk, rename it; UserError where that cannot be done."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{_LITTER}")
+    # By process and thread: of two threads that write the same file, one would rename what the other has open.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}{_LITTER}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as file:
