@@ -145,10 +145,10 @@ def can_be_judged(scene: EditScene, config: RunConfig) -> bool:
     """Whether the built-in judge can say if a run looks like its prompt: the prompt guides the shape, and asks for one
     part, in the judge's words, to be added.
     """
-    vocabulary = _words(config)
-    if config.geometry.lambda_sds == 0 or scene.subtracts or vocabulary is None:
+    vocabulary, judged = _words(config), vocabulary_of(BUILTIN_FINE)
+    if config.geometry.lambda_sds == 0 or scene.subtracts or vocabulary is None or judged is None:
         return False
-    return _wanted(scene, vocabulary) is not None
+    return _wanted(scene, vocabulary) in judged.parts
 
 
 def judge_run(geometry: GeometryStage, say: Callable[[str], None]) -> Verdict | None:

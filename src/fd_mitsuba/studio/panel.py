@@ -14,6 +14,7 @@ import numpy as np
 
 from fd_mitsuba.assets.readers import READERS
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
+from fd_mitsuba.studio.action_panel import ActionPanel
 from fd_mitsuba.studio.canvas import LIGHTS
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.live_check import LiveCheck
@@ -31,7 +32,7 @@ _REGION_BUTTONS = {"Add on top": "add", "Mirror": "mirror", "Remove": "remove"}
 _STEPS = {"Undo": "undo", "Redo": "redo"}
 
 
-class Panel:
+class Panel(ActionPanel):
     """Builds the fields; `show_*` fills them from the session.
 
     Args:
@@ -50,7 +51,8 @@ class Panel:
         actions: Mapping[str, Callable[[Any], object]],
         visible: dict[str, bool],
     ) -> None:
-        self.session, self._gui, self._heard, self._actions = session, server.gui, heard, actions
+        super().__init__(server.gui, heard, actions)
+        self.session = session
         self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._gui.set_panel_label("fd_mitsuba studio")
         self._prompt()
@@ -67,17 +69,9 @@ class Panel:
             self.light = self._gui.add_dropdown("Light", tuple(LIGHTS), hint="of this page; a run is lit by the scene")
             self.light.on_update(self._do("light"))
 
-    def _button(self, label: str, action: str, **options: Any) -> Any:
-        button = self._gui.add_button(label, **options)
-        button.on_click(self._do(action))
-        return button
-
-    def _do(self, action: str) -> Callable[[Any], None]:
-        return self._heard(lambda event: self._actions[action](event))
-
     def _prompt(self) -> None:
         self.prompt = self._gui.add_text(
-            "Prompt", self.session.state.prompt, hint="what the edited object shall look like"
+            "Prompt", self.session.state.prompt, hint="what the edited object should look like"
         )
         self.prompt.on_update(self._heard(lambda event: self.session.set_prompt(event.target.value)))
         self.reading = self._gui.add_markdown("")
@@ -89,7 +83,7 @@ class Panel:
         self.region.on_update(self._heard(lambda event: session.select(event.target.value)))
         self.part = self._gui.add_text("Part", "part", hint="regions of one part grow together")
         self.part_prompt = self._gui.add_text(
-            "Its prompt", "", hint="what this part alone shall be, as in 'a hat'; blank: the prompt above says it"
+            "Its prompt", "", hint="what this part alone should be, as in 'a hat'; blank: the prompt above says it"
         )
         self.centre = self._gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=1e-3)
         low, high, step = _range_of_radii(state.regions.frame.scale)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fd_mitsuba.studio.action_panel import ActionPanel
 from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.plain_text import escaped
 from fd_mitsuba.studio.results import FORMATS
@@ -24,7 +25,7 @@ _MOST_LOSSES = 4
 _EMPTY_CHART = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
 
 
-class RunPanel:
+class RunPanel(ActionPanel):
     """Builds its fields where the caller's tab is open; arguments as of `Panel`."""
 
     def __init__(
@@ -34,17 +35,10 @@ class RunPanel:
         heard: Callable[[Callable[[Any], object]], Callable[[Any], None]],
         actions: Mapping[str, Callable[[Any], object]],
     ) -> None:
-        self.session, self._gui, self._heard, self._actions = session, server.gui, heard, actions
+        super().__init__(server.gui, heard, actions)
+        self.session = session
         self._run()
         self._result()
-
-    def _button(self, label: str, action: str, **options: Any) -> Any:
-        button = self._gui.add_button(label, **options)
-        button.on_click(self._do(action))
-        return button
-
-    def _do(self, action: str) -> Callable[[Any], None]:
-        return self._heard(lambda event: self._actions[action](event))
 
     def _run(self) -> None:
         settings = self.session.state.settings
