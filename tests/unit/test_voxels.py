@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from fd_mitsuba.baselines.voxels.edit_stage import loss_correlation
 from fd_mitsuba.baselines.voxels.grid import VoxelGrid, along, interpolated, on_film, ray_weights, rays_of
-from fd_mitsuba.baselines.voxels.rendering import render_normals, render_values, view_weights
+from fd_mitsuba.baselines.voxels.rendering import grid_images, render_normals, render_values, view_weights
 from fd_mitsuba.baselines.voxels.surface import SURFACE_ALPHA, grid_surface
 from fd_mitsuba.scene.triangle_mesh import topology
 from fd_mitsuba.scene.views import CameraBatch
@@ -135,3 +135,12 @@ def test_the_surface_of_a_ball_is_closed_and_as_large_as_the_ball() -> None:
     with torch.no_grad():
         grid.density.fill_(-8.0)
     assert grid_surface(grid) is None
+
+
+def test_a_white_background_stays_white_behind_empty_space() -> None:
+    """Empty space covers two per cent of a ray; its colour must count where its coverage does."""
+    grid = VoxelGrid(64, kind="colour", background=1.0)
+    with torch.no_grad():
+        grid.features.fill_(12.0)
+    rgb = grid_images(grid, FRONT, 8, 64).rgb
+    assert torch.allclose(rgb, torch.ones_like(rgb), atol=1e-3)

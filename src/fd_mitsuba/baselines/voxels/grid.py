@@ -86,7 +86,10 @@ class VoxelGrid(nn.Module):
 
     def shown(self, features: Float[Tensor, "F N"]) -> Float[Tensor, "F N"]:
         """n(x) or c(x) of the formulas above, of raw features; gradients flow."""
-        return features.sigmoid() if self.kind == "colour" else features / features.norm(dim=0).clamp(min=1)
+        if self.kind == "colour":
+            return features.sigmoid()
+        # By its square: torch's norm across rows takes a fifth of a whole step.
+        return features * features.square().sum(dim=0).clamp(min=1).rsqrt()
 
     def lookup(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "F N"]]:
         """Raw density and features at points within the cube; gradients flow to the grid."""

@@ -11,7 +11,9 @@ from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.scene.views import CameraBatch
 
 RAYS_AT_ONCE = 1 << 13
-_LEAST_WEIGHT = 1e-4
+_LEAST_WEIGHT = {"normals": 1e-3, "colour": 1e-4}
+"""Of a point of a ray whose normal or colour counts. Most points lie in empty space (`grid.EMPTY`), which takes 4e-4 of
+a ray: it needs no normal, but without a colour a plain background would be darker behind it."""
 
 
 @torch.no_grad()
@@ -69,7 +71,7 @@ def view_weights(grid: VoxelGrid, cameras: CameraBatch, size: int, samples: int)
             some, length = along(rays.chosen(slice(begin, begin + RAYS_AT_ONCE)), samples)
             raw = interpolated(grid.density[None], some.view(-1, 3), grid.half_extent).view(some.shape[:2])
             weights = ray_weights(grid.sigma(raw), length)
-            ray, piece = (weights > _LEAST_WEIGHT).nonzero(as_tuple=True)
+            ray, piece = (weights > _LEAST_WEIGHT[grid.kind]).nonzero(as_tuple=True)
             points.append(some[ray, piece])
             pixels.append(ray + begin)
             kept.append(weights[ray, piece])
@@ -88,7 +90,7 @@ def traced(grid: VoxelGrid, rays: Rays, samples: int, jitter: Tensor | None = No
     raw = interpolated(grid.density[None], points.view(-1, 3), grid.half_extent).view(shape)
     weights = ray_weights(grid.sigma(raw), length)
     # Normals count only where a ray ends: at one point in ten.
-    ray, place = (weights.detach() > _LEAST_WEIGHT).nonzero(as_tuple=True)
+    ray, place = (weights.detach() > _LEAST_WEIGHT[grid.kind]).nonzero(as_tuple=True)
     shown = grid.shown(interpolated(grid.features, points[ray, place], grid.half_extent))
     expected = shown.new_zeros(shape[0], 3).index_add(0, ray, (shown * weights[ray, place]).t())
     covered = weights.sum(dim=1, keepdim=True)
