@@ -35,7 +35,8 @@ from fd_mitsuba.config import CamerasConfig  # noqa: E402
 from fd_mitsuba.fields.texture import TextureField  # noqa: E402
 from fd_mitsuba.render.appearance_pass import AppearancePass  # noqa: E402
 from fd_mitsuba.render.part_shading import PartShading  # noqa: E402
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402
+from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch, sample_views  # noqa: E402
 

@@ -31,7 +31,8 @@ from fd_mitsuba.backend.peak_memory import peak_memory_mb  # noqa: E402
 from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.export.assets import PartAsset, export_assets  # noqa: E402
 from fd_mitsuba.fields.texture import TextureField  # noqa: E402
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402
+from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
 
 
 def lumpy_ball(faces: int) -> tuple[np.ndarray, np.ndarray]:

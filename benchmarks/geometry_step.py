@@ -39,7 +39,8 @@ from plain_reference import render_plain  # noqa: E402
 
 from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews, Phase  # noqa: E402
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402
+from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
 from fd_mitsuba.training.geometry_stage import GeometryStage  # noqa: E402
 
 PICTURE_SIZE = 64

@@ -32,7 +32,7 @@ from fd_mitsuba.evaluation.verdict import judged_views  # noqa: E402
 from fd_mitsuba.io.json_object import write_json  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
-from fd_mitsuba.scene.edit_scene import load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
 from fd_mitsuba.viewing.turntable import render_ring, write_sheet  # noqa: E402
 
 VIEWS, SHEET_SIZE = 8, 112

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageChops, ImageDraw, ImageFilter, ImageFont
 
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.scene_file import SceneFile
 
 HERE = Path(__file__).resolve().parent

@@ -19,7 +19,8 @@ mi = ready_mitsuba()
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures  # noqa: E402
 from fd_mitsuba.render.gbuffer import GBuffer  # noqa: E402
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading  # noqa: E402
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.edit_scene import EditScene  # noqa: E402
+from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh  # noqa: E402
 from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 

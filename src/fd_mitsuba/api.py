@@ -137,7 +137,7 @@ def load_scene(
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
     with own_threads(threads, variant):
         load_plugins(plugins)
-        from fd_mitsuba.scene.edit_scene import load_edit_scene
+        from fd_mitsuba.scene.load_scene import load_edit_scene
 
         if at:
             regions = _placed(Path(path), dict(parameters or {}), regions, at, size)

@@ -16,7 +16,8 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.runs.preservation import measure_preservation
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.training.appearance_stage import AppearanceStage
 from fd_mitsuba.training.loop import run_stage

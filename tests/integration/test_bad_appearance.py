@@ -15,7 +15,7 @@ from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 Make = Callable[..., Path]
 SKY = '<emitter type="envmap" id="sky"><string name="filename" value="sky.exr"/>{}</emitter>'

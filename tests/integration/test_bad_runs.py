@@ -300,6 +300,6 @@ def test_interrupt_outside_the_loop(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fd_mitsuba.scene.edit_scene.load_edit_scene", interrupt)
+    monkeypatch.setattr("fd_mitsuba.scene.load_scene.load_edit_scene", interrupt)
     code, line = call(capfd, command, scene)
     assert code == 130 and "interrupted" in line and ("--resume" in line) == (command == "run")

@@ -14,7 +14,7 @@ import trimesh
 from conftest import BASE, INTEGRATOR, LIGHT, REGION, write_ply
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 Make = Callable[..., Path]
@@ -331,7 +331,7 @@ def test_bad_indices_do_not_end_the_process(make_scene: Make, tmp_path: Path, na
     path = make_scene()
     MESHES[name][0](tmp_path / "animal.ply")
     program = (
-        "import sys\nfrom fd_mitsuba.errors import UserError\nfrom fd_mitsuba.scene.edit_scene import load_edit_scene\n"
+        "import sys\nfrom fd_mitsuba.errors import UserError\nfrom fd_mitsuba.scene.load_scene import load_edit_scene\n"
         "try:\n    load_edit_scene(sys.argv[1])\nexcept UserError as error:\n    print(error)\n    sys.exit(1)\n"
     )
     done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, timeout=120)
@@ -350,7 +350,7 @@ def test_one_thread_can_read_an_exr(make_scene: Make, tmp_path: Path) -> None:
         import sys
         import numpy as np
         from fd_mitsuba.backend import startup
-        from fd_mitsuba.scene.edit_scene import load_edit_scene
+        from fd_mitsuba.scene.load_scene import load_edit_scene
         from fd_mitsuba.backend.file_threads import file_threads
         mi = startup.start(threads=1)
         import drjit as dr

@@ -39,7 +39,8 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.guidance.sources import GUIDANCES
 from fd_mitsuba.runs.own_meshes import as_mesh
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.views import CameraBatch
 
 SETTINGS = f"""

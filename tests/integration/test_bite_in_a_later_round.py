@@ -13,7 +13,7 @@ from test_two_rounds import first, of_part  # noqa: F401
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.runs.parts import list_parts
 from fd_mitsuba.runs.pipeline import export_run, run
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 BITE = """<scene version="3.0.0"><shape type="focal_region" id="bite"><string name="part" value="bite"/>
   <string name="mode" value="subtract"/><transform name="to_world">

@@ -23,7 +23,7 @@ from fd_mitsuba.evaluation.report.gallery import write_gallery
 from fd_mitsuba.evaluation.report.run_page import write_report
 from fd_mitsuba.evaluation.run_evaluation import Protocol, evaluate_run
 from fd_mitsuba.runs import pipeline
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 ODD = ["3", '"text"', "[]", "null", "true", "Infinity", "-1e999", "9" * 5000, "[" * 50_000, '{"a": ' * 3000, "{", "\0"]
 """What may stand in the place of a value, or of a whole file."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_runs import ORANGE_PART, write_place
+from tiny_runs import FIELD, ORANGE_PART, TEXTURE, write_place
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.evaluation import run_evaluation as evaluate
@@ -17,21 +17,16 @@ from fd_mitsuba.evaluation.ablation import ablate, ablation_jobs, chosen_rows
 from fd_mitsuba.evaluation.ablation_table import ablation_header, ablation_rows, write_ablation_sheet
 from fd_mitsuba.evaluation.clip import ClipJudge
 from fd_mitsuba.runs import pipeline
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
-SETTINGS = """
-[field]
-levels = 2
-log2_table = 8
-finest_resolution = 16
+SETTINGS = f"""
+{FIELD}
 [geometry]
 steps = 2
 grid_resolution = 16
 lambda_sds = 0.0
 focal_samples = 64
-[texture]
-levels = 2
-log2_table = 8
+{TEXTURE}
 [appearance]
 steps = 2
 views = 1

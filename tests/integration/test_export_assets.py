@@ -22,7 +22,8 @@ from viewer_setup import glb_faults, needs_validator
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import FORMATS, PartAsset, export_assets
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 Make = Callable[..., Path]

@@ -11,7 +11,7 @@ import pytest
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.runs.run_folder import describe_run
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, list_checkpoints, save_checkpoint
 from fd_mitsuba.training.geometry_stage import GeometryStage
 

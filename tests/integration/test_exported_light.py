@@ -17,7 +17,7 @@ from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.part_shading import PartShading
 from fd_mitsuba.render.tonemap import to_linear
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.views import CameraBatch

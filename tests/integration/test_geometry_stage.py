@@ -14,7 +14,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import StepRecord

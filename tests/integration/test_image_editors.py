@@ -19,7 +19,8 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.views import CameraBatch
 
 VIEWS = CameraBatch.around(np.array([30.0, 210.0]), 20.0, 3.4, 45.0)

@@ -18,7 +18,7 @@ from viewer_setup import VIEWERS, needs_browser
 
 from fd_mitsuba.evaluation.report.gallery import write_gallery
 from fd_mitsuba.evaluation.report.run_page import write_report
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), needs_browser]
 

@@ -28,7 +28,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.export.final_surface.final_part import final_part
 from fd_mitsuba.io.atomic import is_litter
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.training.checkpoint import list_checkpoints
 from fd_mitsuba.training.record import read_metrics

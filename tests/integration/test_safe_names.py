@@ -20,7 +20,7 @@ from fd_mitsuba.evaluation.report.gallery import write_gallery
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.export.obj import ObjMesh, obj_files
 from fd_mitsuba.export.pictures import Picture, png
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 Make = Callable[..., Path]

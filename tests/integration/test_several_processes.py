@@ -13,6 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from tiny_pipelines import save_pipeline
+from tiny_runs import FIELD, TEXTURE
 
 from fd_mitsuba.backend.processes import Processes
 from fd_mitsuba.config import GuidanceConfig
@@ -22,11 +23,8 @@ from fd_mitsuba.guidance.interface import GuidanceViews
 from fd_mitsuba.training.record import read_metrics
 
 SCENE = Path(__file__).resolve().parents[2] / "scenes" / "cat" / "scene.xml"
-SETTINGS = """
-[field]
-levels = 2
-log2_table = 8
-finest_resolution = 16
+SETTINGS = f"""
+{FIELD}
 [geometry]
 steps = 4
 grid_resolution = 20
@@ -35,9 +33,7 @@ views = 8
 spp = 2
 coarse_fraction = 0.5
 lambda_sds = 1e-3
-[texture]
-levels = 2
-log2_table = 8
+{TEXTURE}
 [appearance]
 steps = 3
 views = 8

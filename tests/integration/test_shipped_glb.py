@@ -14,7 +14,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.fields.texture import TextureField
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.training.geometry_stage import GeometryStage
 
 SCENES = sorted((Path(__file__).resolve().parents[2] / "scenes").glob("*/scene.xml"))

@@ -12,7 +12,7 @@ import trimesh
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.export.final_surface.final_part import final_part
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.triangle_mesh import topology
 from fd_mitsuba.training.geometry_stage import GeometryStage
 

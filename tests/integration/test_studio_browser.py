@@ -88,7 +88,7 @@ def test_grow_kill_resume_download(make_scene: Callable[..., Path], tmp_path: Pa
     try:
         record = json.loads((work / "studio.json").read_text())
         start = np.array(record["regions"][0]["centre"])
-        from fd_mitsuba.scene.edit_scene import load_edit_scene
+        from fd_mitsuba.scene.load_scene import load_edit_scene
         from fd_mitsuba.studio.canvas import GIZMO_SCALE
 
         frame = load_edit_scene(scene).frame

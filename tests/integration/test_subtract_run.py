@@ -19,7 +19,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.appearance_outcome import render_run
 from fd_mitsuba.runs.pipeline import export_run, run
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 Make = Callable[..., Path]

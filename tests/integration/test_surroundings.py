@@ -17,7 +17,8 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.mitsuba_xml import mitsuba_scene
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.part_shading import PartShading
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.viewing.lit_views import ring_cameras

@@ -20,7 +20,8 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.runs.run_folder import describe_run
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.training.checkpoint import CheckpointHeader, checkpoint_folder, save_checkpoint

@@ -20,7 +20,8 @@ from viewer_setup import VIEWERS, needs_blender, needs_browser
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.io.srgb import srgb_from_linear
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 Make = Callable[..., Path]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

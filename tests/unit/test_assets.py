@@ -29,7 +29,8 @@ from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.export.pictures import Picture
 from fd_mitsuba.export.scene_pictures import rgba_png
 from fd_mitsuba.scene.base_appearance import BaseAppearance
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.scene_copy import SceneCopy
 from fd_mitsuba.studio.base_glb import only_parts
 

@@ -12,7 +12,8 @@ from PIL import Image
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.base_appearance import BaseAppearance
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 BITMAP = '<texture type="bitmap" name="{name}"><string name="filename" value="paint.png"/>{inner}</texture>'
 RAW = '<boolean name="raw" value="true"/>'

@@ -18,7 +18,7 @@ from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.understood_prompt import understood_prompt
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.cost import unet_weights
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 FINE = "guidance.model=builtin-fine"
 

@@ -17,7 +17,7 @@ from fd_mitsuba.guidance.speed import measured_speed
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.cost import LIT_PICTURES_SECONDS, PHOTOGRAPHS_SECONDS, START_AND_EXPORT_SECONDS, estimate_cost
 from fd_mitsuba.runs.geometry_outcome import prepare_geometry
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.viewing.preview import preview_scene, region_colours
 
 Make = Callable[..., Path]

@@ -17,8 +17,9 @@ from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError, out_of_memory
 from fd_mitsuba.runs import cost_memory
-from fd_mitsuba.runs.cost_memory import SceneSize, check_memory_mb, memory_warning, refuse_too_many_samples, run_memory
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.runs.cost_memory import check_memory_mb, memory_warning, refuse_too_many_samples, run_memory
+from fd_mitsuba.runs.scene_size import SceneSize
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 Make = Callable[..., Path]
 ROOT = Path(__file__).resolve().parents[2]

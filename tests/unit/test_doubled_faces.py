@@ -15,7 +15,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.pipeline import run
 from fd_mitsuba.scene.doubled_faces import without_reversed_copies
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.tessellate import unit_sphere
 

@@ -10,8 +10,8 @@ import pytest
 from conftest import BASE, INTEGRATOR, write_ply
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.region_place import gap_to_base, share_in_grid

@@ -27,7 +27,7 @@ from fd_mitsuba.evaluation.protocol import judged
 from fd_mitsuba.evaluation.similarity import EditPrompt, clip_scores, rank_of, retrieval
 from fd_mitsuba.export.meshes import copy_base
 from fd_mitsuba.fields.texture import TextureField
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.part_material import PlainMaterial
 
 ALL = torch.ones(1, 1, 40, 48, dtype=torch.bool)

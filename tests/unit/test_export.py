@@ -16,7 +16,7 @@ from conftest import BASE, write_ply
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.meshes import copy_base, write_mesh
 from fd_mitsuba.io.ply import ply_bytes
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 Make = Callable[..., Path]

@@ -10,7 +10,7 @@ import pytest
 from cases import CASES
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 Make = Callable[..., Path]
 

@@ -28,7 +28,8 @@ from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.part_shading import PartShading
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.scene.base_appearance import BaseAppearance
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.views import ring_views
 from fd_mitsuba.training.geometry_stage import GeometryStage

@@ -15,7 +15,7 @@ from PIL import Image
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.io.gain_map import gain_map_jpeg
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio.scene_light import scene_light
 
 

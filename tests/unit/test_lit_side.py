@@ -17,8 +17,8 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.scene.base_appearance import base_shapes
-from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.lit_side import ShapeShading, shaded_shapes, shading_warnings
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 INSIDE = CASES / "inside_lit_base"

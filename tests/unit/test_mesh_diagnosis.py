@@ -11,7 +11,7 @@ from cases import CASES
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.mesh_diagnosis import mesh_fault, obj_concave_face
 
 Make = Callable[..., Path]

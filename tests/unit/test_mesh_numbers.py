@@ -17,7 +17,8 @@ from fd_mitsuba.export.assets import PartAsset, export_assets
 from fd_mitsuba.io.srgb import srgb_from_linear
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs
 from fd_mitsuba.scene.base_appearance import base_shapes
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 COLOURS = CASES / "vertex_colours_8bit"

@@ -15,7 +15,7 @@ from fd_mitsuba.export.final_surface.final_part import final_parts
 from fd_mitsuba.export.solid.part_solid import part_solid
 from fd_mitsuba.runs.geometry_outcome import export_geometry
 from fd_mitsuba.runs.own_meshes import base_mesh, creased, edited_mesh, start_mesh
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.viewing.turntable import render_ring

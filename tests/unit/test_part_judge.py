@@ -41,7 +41,7 @@ from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs
 from fd_mitsuba.prior.pictures.part_corpus import SEEDS_APART, UNSEEN_SEED, make_views
 from fd_mitsuba.prior.training.kinds import GEOMETRY_FINE
 from fd_mitsuba.prior.training.part_judge_train import JUDGE_KINDS, JudgeKind, judge_kind, measure, train_part_judge
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.region_place import share_in_grid
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"

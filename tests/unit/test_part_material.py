@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.part_material import PartMaterial, part_material
 
 Make = Callable[..., Path]

@@ -13,7 +13,7 @@ from PIL import Image
 import fd_mitsuba as fd
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_base, load_edit_scene
+from fd_mitsuba.scene.load_scene import load_base, load_edit_scene
 from fd_mitsuba.scene.region_words import ObjectPlaces, region_size
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.viewing.preview import preview_scene

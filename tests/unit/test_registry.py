@@ -29,7 +29,7 @@ from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.sources import load_guidance
 from fd_mitsuba.guidance.variants import VARIANTS
 from fd_mitsuba.runs.choices import REGISTRIES, checked_choices, described
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.region_shapes import REGION_SHAPES, shape_arrays
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh, topology

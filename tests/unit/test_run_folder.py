@@ -18,7 +18,8 @@ from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, identity
 from fd_mitsuba.runs.run_lock import LOCK_NAME
 from fd_mitsuba.runs.saved_run import saved_run
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 Make = Callable[..., Path]
 CONFIG = RunConfig()

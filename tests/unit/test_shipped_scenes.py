@@ -12,7 +12,8 @@ from PIL import Image
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.prior.data.captions import vocabulary
 from fd_mitsuba.runs.check import check_scene
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.scene_file import SceneFile, ready_mitsuba
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
 from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to
 from fd_mitsuba.studio.region_list import RegionList
 from fd_mitsuba.studio.scene_patch import patched, region_spans

@@ -21,7 +21,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.gltf import GltfMesh, glb_bytes
 from fd_mitsuba.export.material import PbrMaterial
 from fd_mitsuba.io.ply import ply_bytes, read_ply
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.studio import runner

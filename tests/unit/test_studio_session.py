@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio import session as sessions
 from fd_mitsuba.studio.history import History
 from fd_mitsuba.studio.job import RunOrder

@@ -15,7 +15,7 @@ from fd_mitsuba.assets.images import pixels
 from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.srgb import linear_from_srgb
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype="<f4")
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))

@@ -13,7 +13,8 @@ from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.evaluation import tries
 from fd_mitsuba.evaluation.tries import run_tries
 from fd_mitsuba.runs.run_folder import check_folder, describe_run
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.training.record import read_metrics
 
 PROMPT = '<integrator type="dual_path"><string name="prompt" value="a pig with two wings"/></integrator>'

@@ -17,7 +17,7 @@ from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export import usd
 from fd_mitsuba.export.assets import PartAsset, export_assets
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.tessellate import unit_sphere
 
 pytest.importorskip("pxr")

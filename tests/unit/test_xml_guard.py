@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run_folder import describe_run, identity
-from fd_mitsuba.scene.edit_scene import load_edit_scene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.normalised_xml import normalise
 from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.scene.xml_guard import scan_scene

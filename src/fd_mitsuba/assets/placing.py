@@ -11,7 +11,7 @@ import numpy as np
 
 from fd_mitsuba.assets.region_xml import region_element
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.scene.edit_scene import load_base
+from fd_mitsuba.scene.load_scene import load_base
 from fd_mitsuba.scene.plugins import DUAL_PATH
 from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion, region_size
 

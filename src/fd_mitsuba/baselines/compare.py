@@ -21,7 +21,8 @@ from fd_mitsuba.evaluation.similarity import Judge
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.choices import checked_choices
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 IMAGE_EDITORS = {"pix2pix_2d": "InstructPix2Pix, view by view", "inpaint_2d": "inpainting, view by view"}
 """Methods that edit single images, and what they are called in their figure."""

@@ -53,7 +53,18 @@ class FieldConfig(Section):
     """Let vertices of the tetrahedral grid move by up to half a cell, where the base's surface is not touched."""
 
 
-class GeometryConfig(Section):
+class OptimisedSection(Section):
+    """What both stages say of AdamW, beside their step sizes."""
+
+    betas: Range = (0.9, 0.99)
+    """Decay rates of AdamW's running averages."""
+    eps: Rate = 1e-15
+    """Smallest divisor in a step of AdamW."""
+    weight_decay: Fraction = 0.01
+    """Weight decay of AdamW."""
+
+
+class GeometryConfig(OptimisedSection):
     """The geometry stage: its steps, the union with the base, and the losses on the part's signed distance."""
 
     steps: Steps = 3000
@@ -62,12 +73,6 @@ class GeometryConfig(Section):
     """Share of the steps in the coarse phase; the rest is the refined phase."""
     learning_rate: Rate = 1e-3
     """Step size of AdamW."""
-    betas: Range = (0.9, 0.99)
-    """Decay rates of AdamW's running averages."""
-    eps: Rate = 1e-15
-    """Smallest divisor in a step of AdamW."""
-    weight_decay: Fraction = 0.01
-    """Weight decay of AdamW."""
     grid_resolution: Annotated[int, Field(ge=8, le=256)] = 64
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
     union_k: Length = 0.15
@@ -158,19 +163,13 @@ class TextureConfig(Section):
         return self
 
 
-class AppearanceConfig(Section):
+class AppearanceConfig(OptimisedSection):
     """The appearance stage: what is rendered, what may be learned, and the losses on the material."""
 
     steps: Steps = 2000
     """Steps of the appearance stage."""
     learning_rate: Rate = 1e-2
     """Step size of AdamW."""
-    betas: Range = (0.9, 0.99)
-    """Decay rates of AdamW's running averages."""
-    eps: Rate = 1e-15
-    """Smallest divisor in a step of AdamW."""
-    weight_decay: Fraction = 0.01
-    """Weight decay of AdamW."""
     views: Views = 4
     """Cameras a step."""
     picture_size: Annotated[int, Field(ge=16, le=4096)] | None = None

@@ -14,7 +14,8 @@ from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
+from fd_mitsuba.runs.cost_memory import memory_warning, run_memory
+from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
 

@@ -7,11 +7,6 @@ with textures of 4096 x 4096, 4.31 GB with baked textures of that size, 1.82 GB 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
-from PIL import Image
-
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.bounds import MOST_SAMPLES
 from fd_mitsuba.config.for_model import is_builtin
@@ -19,8 +14,8 @@ from fd_mitsuba.config.sections import FieldConfig, OutputConfig, TextureConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.memory import available_bytes, held_bytes
-from fd_mitsuba.io.picture_size import picture_size
 from fd_mitsuba.render.geometry_pass import RAYS_AT_ONCE
+from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
 
@@ -43,39 +38,6 @@ _USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, SAMPLES_AT_ONCE, 1024**2
 _TIGHT, _TOO_MUCH = 0.9, 1.25
 """Shares of what is left from which a run is warned of, and refused: the forecast is right to about 15 %."""
 _WORTH_NAMING = 0.25
-
-
-@dataclass(frozen=True)
-class SceneSize:
-    """What of a scene costs memory.
-
-    Attributes:
-        faces: of the base.
-        light_pixels: of all images that emitters show.
-        texture_values: pixels times channels of all other images.
-    """
-
-    faces: int
-    light_pixels: int = 0
-    texture_values: int = 0
-
-    @classmethod
-    def of(cls, scene: EditScene) -> SceneSize:
-        """Read from the heads of the scene's files; an image that does not say its size counts as none."""
-        file = scene.inputs.scene
-        lights, textures = {}, {}
-        for element in file.elements:
-            name = element.properties.get("filename")
-            if not isinstance(name, str) or element.plugin not in ("envmap", "bitmap"):
-                continue
-            path = file.resolve(name)
-            width, height = picture_size(path) or (0, 0)
-            if element.plugin == "envmap":
-                lights[path] = width * height
-            else:
-                textures[path] = width * height * _channels(path)
-        faces = sum(len(mesh.faces) for mesh in scene.base)
-        return cls(faces, sum(lights.values()), sum(textures.values()))
 
 
 def check_memory_mb(size: SceneSize) -> float:
@@ -203,11 +165,3 @@ def _table_bytes(field: FieldConfig | TextureConfig) -> float:
     growth = (field.finest_resolution / field.base_resolution) ** (1 / max(levels - 1, 1))
     sides = (field.base_resolution * growth**level for level in range(levels))
     return sum(4.0 * features * min(table, (side + 1) ** 3) for side in sides)
-
-
-def _channels(path: Path) -> int:
-    try:
-        with Image.open(path) as image:
-            return len(image.getbands())
-    except Exception:  # formats that Pillow does not read, such as EXR
-        return 3

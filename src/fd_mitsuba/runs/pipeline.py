@@ -36,7 +36,7 @@ from fd_mitsuba.runs.appearance_outcome import (
 )
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import latent_size, unet_weights
-from fd_mitsuba.runs.cost_memory import SceneSize, memory_warning, run_memory
+from fd_mitsuba.runs.cost_memory import memory_warning, run_memory
 from fd_mitsuba.runs.follower import refuse_guidance_alone
 from fd_mitsuba.runs.geometry_outcome import (
     cut_out,
@@ -53,6 +53,7 @@ from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
+from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_place import refuse_hidden_parts
 from fd_mitsuba.training.appearance_stage import AppearanceStage

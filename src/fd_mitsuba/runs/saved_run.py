@@ -11,7 +11,8 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import json_fault, read_json_object
 from fd_mitsuba.runs.run_folder import identity
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 
 
 class _Copies(BaseModel):

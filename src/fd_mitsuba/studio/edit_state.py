@@ -12,8 +12,9 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.headroom import frame_with_headroom
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
 from fd_mitsuba.studio.base_glb import base_glb
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio.work_folder import RECORD_NAME, WorkFolder
 
 

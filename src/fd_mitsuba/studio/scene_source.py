@@ -13,7 +13,8 @@ from fd_mitsuba.api import import_asset
 from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
-from fd_mitsuba.scene.edit_scene import EditScene, load_edit_scene
+from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.opening import Opened
 from fd_mitsuba.studio.scene_patch import patched
