@@ -37,14 +37,26 @@ def as_shipped(folder: Path) -> list[str]:
 
 
 def many_faces(folder: Path) -> list[str]:
-    """Its base with three times two cuts of each edge: 1.1 million faces and more."""
+    """Its base with each edge cut twice in two, and a ball beside it: 1.6 million faces."""
     source = trimesh.load(SCENE.with_name("cat.ply"), process=False)
     assert isinstance(source, trimesh.Trimesh)
-    fine = source.subdivide().subdivide().subdivide()
+    fine = trimesh.util.concatenate([source.subdivide().subdivide(), _ball()])
     fine.export(folder / "cat.ply", include_attributes=False)
-    text = SCENE.read_text().replace("../lighting", str(SCENE.parent.parent / "lighting"))
+    text = _text()
     start, end = text.index('<texture type="bitmap" name="base_color">'), text.index('<float name="specular"')
     (folder / "scene.xml").write_text(text[:start] + '<rgb name="base_color" value="0.5"/>' + text[end:])
+    return [str(folder / "scene.xml")]
+
+
+def many_faces_around(folder: Path) -> list[str]:
+    """The same ball as surroundings: 1.3 million faces that are lit and not edited."""
+    for name in ("cat.ply", "cat_base_color.png", "cat_roughness.png"):
+        (folder / name).write_bytes(SCENE.with_name(name).read_bytes())
+    _ball().export(folder / "ball.ply")
+    choice = '<string name="base" value="base"/>'
+    ball = '<shape type="ply" id="ball"><string name="filename" value="ball.ply"/></shape>'
+    text = _text().replace("</integrator>", f"{choice}</integrator>").replace("</scene>", f"{ball}</scene>")
+    (folder / "scene.xml").write_text(text)
     return [str(folder / "scene.xml")]
 
 
@@ -61,12 +73,11 @@ def large_light(folder: Path) -> list[str]:
 
 def large_textures(folder: Path) -> list[str]:
     """The base's textures at 4096 x 4096."""
-    text = SCENE.read_text().replace("../lighting", str(SCENE.parent.parent / "lighting"))
     for name in ("cat_base_color.png", "cat_roughness.png"):
         with Image.open(SCENE.with_name(name)) as picture:
             picture.resize((4096, 4096)).save(folder / name, compress_level=1)
     (folder / "cat.ply").write_bytes(SCENE.with_name("cat.ply").read_bytes())
-    (folder / "scene.xml").write_text(text)
+    (folder / "scene.xml").write_text(_text())
     return [str(folder / "scene.xml")]
 
 
@@ -80,8 +91,29 @@ def fine_grid(folder: Path) -> list[str]:
     return [str(SCENE), "--set", "geometry.grid_resolution=128"]
 
 
+def _text() -> str:
+    """The scene file, to be put in another folder."""
+    return SCENE.read_text().replace("../lighting", str(SCENE.parent.parent / "lighting"))
+
+
+def _ball() -> trimesh.Trimesh:
+    """Of 1.3 million faces, beside the cat."""
+    ball = trimesh.creation.icosphere(subdivisions=8, radius=3.5)
+    ball.apply_translation([-0.5, 3.5, 40.0])
+    return ball
+
+
 CASES: dict[str, Callable[[Path], list[str]]] = {
-    make.__name__: make for make in (as_shipped, many_faces, large_light, large_textures, large_bake, fine_grid)
+    make.__name__: make
+    for make in (
+        as_shipped,
+        many_faces,
+        many_faces_around,
+        large_light,
+        large_textures,
+        large_bake,
+        fine_grid,
+    )
 }
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
+from conftest import INTEGRATOR
 from PIL import Image
 
 from fd_mitsuba.cli.main import main
@@ -33,6 +35,8 @@ PEAKS = {
     "all its steps": (CAT, ["geometry.steps=400"], 1626, 1163),
     "one thread": (CAT, [], 1645, 1167),
     "1.09 million faces": (SceneSize(1_088_768, 131_072, 1_916_928), [], 2341, 1958),
+    "1.58 million faces": (SceneSize(1_582_912, 131_072, 1_916_928), [], 2800, None),
+    "1.31 million faces around it": (SceneSize(17012, 131_072, 1_916_928, 1_310_720), [], 1839, None),
     "2.0 million faces": (SceneSize(1_999_872, 131_072, 1_916_928), [], 3538, 2850),
     "light of 4096 x 2048": (SceneSize(17012, 4096 * 2048, 1_916_928), [], 2429, 1449),
     "light of 8192 x 4096": (SceneSize(17012, 8192 * 4096, 1_916_928), [], 6462, 2547),
@@ -63,6 +67,7 @@ def test_peaks_of_a_smoke_run() -> None:
     [
         (CAT, 408),
         (SceneSize(1_999_872, 131_072, 1_916_928), 1977),
+        (SceneSize(17012, 131_072, 1_916_928, 1_310_720), 630),
         (SceneSize(17012, 8192 * 4096, 1_916_928), 2648),
     ],
 )
@@ -77,6 +82,23 @@ def test_sizes_come_from_the_heads_of_the_files() -> None:
         with Image.open(ROOT / "scenes" / "cat" / f"cat_{name}.png") as picture:
             values += np.asarray(picture).size
     assert CAT.texture_values == values
+
+
+def test_meshes_around_the_base_are_counted_by_their_files(make_scene: Make, tmp_path: Path) -> None:
+    """A PLY, an OBJ whose faces are counted by its lines, and a lamp."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.export(tmp_path / "ball.ply")
+    (tmp_path / "box.obj").write_text(trimesh.exchange.obj.export_obj(trimesh.creation.box()))
+    lamp = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'
+    around = (("ply", "ball.ply", ""), ("obj", "box.obj", ""), ("ply", "ball.ply", lamp))
+    shapes = "".join(
+        f'<shape type="{kind}"><string name="filename" value="{name}"/><transform name="to_world">'
+        f'<translate x="{9 * place}"/></transform>{more}</shape>'
+        for place, (kind, name, more) in enumerate(around, start=2)
+    )
+    integrator = INTEGRATOR.replace("</integrator>", '<string name="base" value="body"/></integrator>')
+    size = SceneSize.of(load_edit_scene(make_scene(extra=shapes, integrator=integrator)))
+    assert size.faces_around == 320 + 12 + 320
 
 
 def test_every_cause_is_named_where_it_is_the_largest(make_scene: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,6 +116,7 @@ def test_every_cause_is_named_where_it_is_the_largest(make_scene: Make, monkeypa
     assert "needs about 2.2 GB" in warning and warning.endswith("1.9 GB are left; free some")
     for size, override, words in (
         (SceneSize(10_000_000), (), "or take a mesh with fewer: "),
+        (SceneSize(1000, 0, 0, 40_000_000), (), "or take meshes with fewer: "),
         (SceneSize(1000, 8192 * 4096), (), "or take a smaller one: "),
         (SceneSize(1000, 0, 10**9), (), "are for the scene's textures"),
         (CAT, ("output.texture_size=8192",), "or lower it: 11.8 GB are for output.texture_size"),

@@ -1,8 +1,9 @@
 """How much memory a run will take at its peak: what a run takes in any case, and what each input adds.
 
 The numbers are differences of measured peaks (resident set, 2 cores, `configs/quick.toml`, the cat): 1.80 GB as it is
-shipped; 2.34 GB with 1.1 million faces and 3.54 with 2.0, 5.3 to 6.5 GB under a light of 8192 x 4096 pixels, 3.24 GB
-with textures of 4096 x 4096, 4.31 GB with baked textures of that size, 1.82 GB on a grid of 128 cells a side.
+shipped; 2.34 GB with 1.1 million faces, 2.80 with 1.6 and 3.54 with 2.0, 1.84 GB with 1.3 million around the base, 5.3
+to 6.5 GB under a light of 8192 x 4096 pixels, 3.24 GB with textures of 4096 x 4096, 4.31 GB with baked textures of that
+size, 1.82 GB on a grid of 128 cells a side.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _IMPORTS, _BUILTIN = 390.0, 200.0
 _SHAPE, _MATERIAL = 390.0, 370.0
 """What the geometry stage with its exports, and then the appearance stage with its own, add in any case."""
 _PER_FACE = {"check": 830.0, "run": 740.0}
+_PER_FACE_AROUND = 160.0
 _PER_LIGHT_PIXEL = {"check": 70.0, "run": 125.0}
 _PER_HELD_LIGHT_PIXEL = 41.0
 _PER_TEXTURE_VALUE = {"check": 3.0, "run": 29.0}
@@ -115,9 +117,15 @@ def refuse_too_many_samples(pictures: int, size: int, spp: int, options: str) ->
         raise UserError(f"{options}: {pictures} pictures at once are {samples} samples, {much}; lower size or samples")
 
 
-_CAUSES = {"faces": f"the faces of the {BASE_NAME}", "light": "the light's image", "textures": "the scene's textures"}
+_CAUSES = {
+    "faces": f"the faces of the {BASE_NAME}",
+    "surroundings": "the faces around it",
+    "light": "the light's image",
+    "textures": "the scene's textures",
+}
 _REMEDIES = {
     "faces": "take a mesh with fewer",
+    "surroundings": "take meshes with fewer",
     "light": "take a smaller one",
     "textures": "take smaller ones",
     "guidance.model": "lower guidance.views_per_call or take a smaller model",
@@ -127,6 +135,7 @@ _REMEDIES = {
 def _scene_terms(size: SceneSize, command: str) -> dict[str, float]:
     return {
         "faces": _PER_FACE[command] * size.faces / _MIB,
+        "surroundings": _PER_FACE_AROUND * size.faces_around / _MIB,
         "light": _PER_LIGHT_PIXEL[command] * size.light_pixels / _MIB,
         "textures": _PER_TEXTURE_VALUE[command] * size.texture_values / _MIB,
     }
