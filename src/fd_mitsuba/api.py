@@ -58,7 +58,7 @@ def import_asset(
     size: str | None = None,
     light: Path | str | None = None,
 ) -> ImportedAsset:
-    """Write a scene to edit, with everything that it reads, out of a GLB, glTF, OBJ, DAE, 3DS, PLY, STL or OFF.
+    """Write a scene to edit, with everything that it reads, out of a GLB, glTF, OBJ, DAE, 3DS, PLY, STL, OFF or ZIP.
 
     Meshes become PLY, one shape a material, in the asset's own unit and turned so that up is +y and front is +z;
     materials become `principled` BSDFs; images are kept byte for byte where that is possible. Mitsuba is not started.

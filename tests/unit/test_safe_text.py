@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fd_mitsuba.errors import printable
-from fd_mitsuba.io.safe_text import quoted_link, safe_name
+from fd_mitsuba.io.safe_text import harmless_file_name, quoted_link, safe_name
 
 ANYTHING = st.text(st.characters(exclude_categories=()), max_size=300)
 
@@ -20,6 +20,20 @@ def test_a_name_is_a_name(text: str, suffix: str) -> None:
     name = safe_name(text, suffix=suffix)
     assert re.fullmatch(r"\w[\w.-]*", name) and name.endswith(suffix)
     assert "/" not in name and len(name.encode()) < 255 and name not in (".", "..")
+
+
+@given(ANYTHING)
+def test_a_file_name_from_outside_stays_in_its_folder(text: str) -> None:
+    name = harmless_file_name(text)
+    assert name.isprintable() and not set(name) & set('/\\:*?"<>|') and name[0] not in ".- "
+    assert 0 < len(name.encode()) < 255
+
+
+def test_a_harmless_file_name_stays_as_others_refer_to_it() -> None:
+    for name in ("oak wood.png", "Übergrößen (2).mtl", "木.jpg", "a--b;c.obj"):
+        assert harmless_file_name(f"C:\\models/{name}") == name
+    assert harmless_file_name("../.profile") == "_profile" and harmless_file_name("nul.png") == "_nul.png"
+    assert harmless_file_name("a\nb.obj") == "a_b.obj" and harmless_file_name("") == "_"
 
 
 @given(st.lists(ANYTHING, max_size=8))

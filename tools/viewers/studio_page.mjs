@@ -115,9 +115,10 @@ try {
     await download.saveAs(join(folder, said.download));
   } else {
     if (options.upload) {
-      await page.locator("input[type=file]").setInputFiles(options.upload);
-      await page.getByText(options.answer).waitFor();
-      said.notes = await page.locator(".mantine-Notification-root").allInnerTexts();
+      const frame = page.frameLocator("iframe"); // a path, or several
+      await frame.locator("input[type=file]").setInputFiles(options.upload);
+      await frame.getByText(options.answer).waitFor();
+      said.notes = [await frame.locator("#told").innerText()];
     }
     if (options.tab) await open(page, options.tab);
     if (options.shading) await choose(page, "Shown as", options.shading);

@@ -147,6 +147,7 @@ class Asset:
         unit: "mm", "cm" or "m", likewise.
         flat: whether meshes without normals have flat faces; else they are smooth but for sharp edges.
         notes: what was left out or understood in another way, a sentence each.
+        packed: the mesh file in an archive that it was read from; "": the file was the mesh.
     """
 
     meshes: tuple[AssetMesh, ...]
@@ -156,3 +157,4 @@ class Asset:
     unit: str | None = None
     flat: bool = False
     notes: tuple[str, ...] = ()
+    packed: str = ""

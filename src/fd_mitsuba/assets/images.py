@@ -24,7 +24,8 @@ _READ_BY_MITSUBA = ("L", "RGB", "RGBA")
 
 
 def beside(folder: Path, name: str) -> Path:
-    """The file of that name in an asset's folder or below it.
+    """The file of that name in an asset's folder or below it; by its last part where it is there alone, without the
+    folders that it had: a browser sends files without theirs.
 
     Args:
         name: relative, with `/` or as Windows writes it.
@@ -35,6 +36,8 @@ def beside(folder: Path, name: str) -> Path:
     place = PurePosixPath(unquote(name).replace("\\", "/"))
     outside = place.is_absolute() or ".." in place.parts or ":" in place.parts[0] if place.parts else True
     try:
+        if not outside and not (folder / place).exists() and (folder / place.name).is_file():
+            place = PurePosixPath(place.name)
         outside = outside or not (folder / place).resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):
         outside = True

@@ -88,9 +88,8 @@ def import_file(
     notes = list(asset.notes)
     shapes = scene_shapes(asset, notes)
     vertices, faces = _whole(path, shapes)
-    orientation = find_orientation(
-        vertices, faces, path.suffix.lower(), (asset.up, asset.front), (wanted[0], wanted[1])
-    )
+    suffix = Path(asset.packed or path).suffix.lower()
+    orientation = find_orientation(vertices, faces, suffix, (asset.up, asset.front), (wanted[0], wanted[1]))
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
     regions, about = placed_regions(places, at or ("head",), size)

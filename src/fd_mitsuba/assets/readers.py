@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,12 +32,19 @@ READERS: dict[str, Callable[[Path], Asset]] = {
     ".stl": _reader("plain_meshes", "read_stl"),
     ".off": _reader("plain_meshes", "read_off"),
 }
-"""Suffix -> reader."""
+"""Suffix -> reader of a mesh."""
+ARCHIVES: dict[str, Callable[[Path], Asset]] = {".zip": _reader("archive", "read_zip")}
+"""Suffix -> reader of a file that holds a mesh with what it refers to."""
+
+
+def formats_in_words(suffixes: Iterable[str]) -> str:
+    """Such as "GLB, OBJ"."""
+    return ", ".join(name.removeprefix(".").upper() for name in suffixes)
 
 
 def is_asset(path: Path | str) -> bool:
     """Whether a file's name says that it is a mesh to import, and no scene."""
-    return Path(path).suffix.lower() in READERS
+    return Path(path).suffix.lower() in READERS | ARCHIVES
 
 
 def read_asset(path: Path) -> Asset:
@@ -48,15 +55,22 @@ def read_asset(path: Path) -> Asset:
     """
     from fd_mitsuba.assets.broken import BrokenAsset
 
-    suffix = path.suffix.lower()
-    if suffix not in READERS:
-        known = ", ".join(name.removeprefix(".").upper() for name in READERS)
-        raise UserError(f"{path}: {suffix or 'no suffix'} is not read ({known} are); export it as GLB, as from Blender")
     try:
-        return READERS[suffix](path)
+        return read_named(path)
     except BrokenAsset as error:
         raise UserError(f"{path}: {error}") from None
-    except (MemoryError, UserError):
-        raise
+
+
+def read_named(path: Path) -> Asset:
+    """As `read_asset`; BrokenAsset for what is wrong, without the file's name."""
+    from fd_mitsuba.assets.broken import BrokenAsset
+
+    suffix = path.suffix.lower()
+    reader = (READERS | ARCHIVES).get(suffix)
+    if reader is None:
+        known = formats_in_words((*READERS, *ARCHIVES))
+        raise BrokenAsset(f"{suffix or 'no suffix'} is not read ({known} are); export it as GLB, as from Blender")
+    try:
+        return reader(path)
     except (ValueError, IndexError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise UserError(f"{path}: is damaged ({first_line(error)}); export the model anew") from None
+        raise BrokenAsset(f"is damaged ({first_line(error)}); export the model anew") from None

@@ -13,7 +13,9 @@ from fd_mitsuba.cli.scene_options import axis_options, placing_options
 def add_import_command(commands: argparse._SubParsersAction) -> None:
     """Put `import` beside the other commands."""
     parser = commands.add_parser("import", help="make a scene to edit out of a GLB, OBJ, DAE, 3DS, PLY, STL or OFF")
-    parser.add_argument("asset", help="mesh file: .glb .gltf .obj .dae .3ds .ply .stl .off")
+    parser.add_argument(
+        "asset", help="mesh file: .glb .gltf .obj .dae .3ds .ply .stl .off, or a .zip of one with its images"
+    )
     parser.add_argument("-o", "--output", metavar="FOLDER", help="the scene's folder; default: scenes/<asset>")
     parser.add_argument("--prompt", help="what the edited object should look like")
     parser.add_argument("--base-prompt", help="what it looks like now; default: the prompt up to its `with`")

@@ -46,6 +46,20 @@ def safe_file_name(name: str, taken: Collection[str] = ()) -> str:
     return safe_name(path.stem, taken, path.suffix)
 
 
+def harmless_file_name(name: str) -> str:
+    """The last part of a path from outside, as it is where it does no harm as the name of a file, and else made safe.
+
+    Other files may refer to it: blanks and letters of all scripts stay, which `safe_file_name` would replace.
+
+    Example:
+        "C:/models/oak wood.png" is "oak wood.png", and ".profile" is "_profile".
+    """
+    last = re.split(r"[/\\]", name)[-1]
+    odd = not last.isprintable() or set(last) & set('<>:"|?*') or last[:1] in (".", "-", " ") or last[-1:] in (".", " ")
+    harmless = last and not odd and len(os.fsencode(last)) <= 200 and not _RESERVED.fullmatch(last)
+    return last if harmless else safe_file_name(last)
+
+
 def quoted_link(path: PurePath | str) -> str:
     """A relative path as `href`: with `/`, and everything quoted that could end it or make it a script's address."""
     text = path.as_posix() if isinstance(path, PurePath) else path

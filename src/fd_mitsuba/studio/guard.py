@@ -10,7 +10,7 @@ from __future__ import annotations
 import hmac
 import http
 import ipaddress
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -18,6 +18,19 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 COOKIE = "fd_mitsuba_studio"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A page of our own within the server's, and the socket of its script.
+
+    Attributes:
+        page: HTML, served to the server's own pages alone.
+        talk: takes the connection of a WebSocket at the same path.
+    """
+
+    page: bytes
+    talk: Callable[[Any], Awaitable[None]]
 
 
 @dataclass
@@ -57,36 +70,58 @@ class Guard:
         return cookie[COOKIE].value if COOKIE in cookie else ""
 
     @contextmanager
-    def before_server(self) -> Iterator[None]:
-        """While open, a `websockets` server that is started asks this guard first; sets `installed`."""
+    def before_server(self, frames: Mapping[str, Frame] | None = None) -> Iterator[None]:
+        """While open, a `websockets` server that is started asks this guard first; sets `installed`.
+
+        Args:
+            frames: path -> what the server has there besides its own.
+        """
         import websockets.asyncio.server as module
-        from websockets.datastructures import Headers
-        from websockets.http11 import Response
 
         original = module.serve
 
-        def serve(*arguments: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
-            def asked(connection: Any, request: Any) -> Any:
+        def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+            def answer(connection: Any, request: Any) -> Any:
                 if (problem := self.refusal(request.path, request.headers)) is not None:
-                    text = f"{problem}\n".encode()
-                    plain = Headers({"Content-Type": "text/plain", "Content-Length": str(len(text))})
-                    return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", plain, text)
-                answer = None if process_request is None else process_request(connection, request)
-                if answer is not None:
-                    answer.headers["X-Frame-Options"] = "DENY"
-                    answer.headers["Referrer-Policy"] = "no-referrer"
-                    if self.token is not None:
-                        answer.headers["Set-Cookie"] = f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-                return answer
+                    return _response(http.HTTPStatus.FORBIDDEN, "text/plain", f"{problem}\n".encode())
+                frame = self._frame(frames, request)
+                if frame is not None and request.headers.get("Upgrade") != "websocket":
+                    return self._marked(_response(http.HTTPStatus.OK, "text/html", frame.page), "SAMEORIGIN")
+                found = None if frame or process_request is None else process_request(connection, request)
+                return None if found is None else self._marked(found, "DENY")
+
+            async def talk(connection: Any) -> None:
+                frame = self._frame(frames, connection.request)
+                await (handler if frame is None else frame.talk)(connection)
 
             self.installed = True
-            return original(*arguments, process_request=asked, **options)
+            return original(talk, *arguments, process_request=answer, **options)
 
         module.serve = serve
         try:
             yield
         finally:
             module.serve = original
+
+    @staticmethod
+    def _frame(frames: Mapping[str, Frame] | None, request: Any) -> Frame | None:
+        return (frames or {}).get(urlsplit(request.path).path)
+
+    def _marked(self, answer: Any, framing: str) -> Any:
+        """The answer, with who may put it into a frame, and the token for the next visit."""
+        answer.headers["X-Frame-Options"] = framing
+        answer.headers["Referrer-Policy"] = "no-referrer"
+        if self.token is not None:
+            answer.headers["Set-Cookie"] = f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return answer
+
+
+def _response(status: http.HTTPStatus, kind: str, body: bytes) -> Any:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
+    return Response(status, status.phrase, headers, body)
 
 
 def is_local(name: str) -> bool:

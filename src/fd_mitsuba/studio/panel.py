@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fd_mitsuba.assets.readers import READERS
 from fd_mitsuba.conventions import BASE_LONGEST_SIDE
 from fd_mitsuba.studio.action_panel import ActionPanel
 from fd_mitsuba.studio.canvas import LIGHTS
@@ -21,6 +20,7 @@ from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.plain_text import escaped
 from fd_mitsuba.studio.run_panel import RunPanel
 from fd_mitsuba.studio.shading import SHADINGS
+from fd_mitsuba.studio.uploads import PATH
 
 if TYPE_CHECKING:
     import viser
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 AXES = {"left - right (x)": 0, "below - above (y)": 1, "back - front (z)": 2}
 _REGION_BUTTONS = {"Add on top": "add", "Mirror": "mirror", "Remove": "remove"}
 _STEPS = {"Undo": "undo", "Redo": "redo"}
+_FRAME_STYLE = "width: 95%; height: 38px; margin: 0 2.5%; border: 0"
+_UPLOAD = f'<iframe src="{PATH[1:]}" title="Open a mesh" style="{_FRAME_STYLE}"></iframe>'
 
 
 class Panel(ActionPanel):
@@ -55,6 +57,8 @@ class Panel(ActionPanel):
         self.session = session
         self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._gui.set_panel_label("fd_mitsuba studio")
+        # Outside the tabs: what is in one is gone while another is shown, and its upload would be, too.
+        self._gui.add_html(_UPLOAD)
         self._prompt()
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Place"):
@@ -99,13 +103,6 @@ class Panel(ActionPanel):
         self.change_buttons = self._gui.add_button_group("Change", tuple(_STEPS))
         self.change_buttons.on_click(self._heard(lambda event: actions[_STEPS[event.target.value]](event)))
         self.check = self._gui.add_markdown("checking...")
-        icon: Any = "file-upload"
-        self._gui.add_upload_button(
-            "Open a mesh file",
-            icon=icon,
-            mime_type=",".join(READERS),
-            hint="such as a GLB; it becomes the base of another round",
-        )
 
     def _field_changed(self) -> None:
         with self.session.lock:

@@ -55,7 +55,7 @@ class RunPanel(ActionPanel):
             )
         self.estimate = self._gui.add_markdown("")
         self.grow = self._button("Grow", "grow", color="green", icon="plant")
-        self._button("Grow with another seed", "another_seed")
+        self.another = self._button("Grow with another seed", "another_seed")
         self._button("Save scene", "save", icon="device-floppy")
 
     def _result(self) -> None:
@@ -88,7 +88,11 @@ class RunPanel(ActionPanel):
     def show_check(self, check: LiveCheck) -> None:
         """How long a run would take, and whether one can be started."""
         self.estimate.content = check.estimate if check.refusal is None else "**not possible yet**, see above"
-        self.grow.disabled = check.refusal is not None
+        self.let_grow(check.refusal is None)
+
+    def let_grow(self, possible: bool) -> None:
+        """Whether a run can be started now."""
+        self.grow.disabled = self.another.disabled = not possible
 
     def show_runs(self) -> None:
         """The runs, and the state of the one that is shown."""

@@ -10,10 +10,14 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.studio.guard import Guard, is_local
+from fd_mitsuba.studio.guard import Frame, Guard, is_local
 from fd_mitsuba.studio.session import Session
+
+if TYPE_CHECKING:
+    import viser
 
 HOST = "127.0.0.1"
 
@@ -42,19 +46,23 @@ class StudioServer:
         require_viser()
         import viser
 
+        from fd_mitsuba.studio.uploads import PATH, Uploads
         from fd_mitsuba.studio.view import View
 
         _refuse_taken(host, port)
         local = is_local(host)
         guard = Guard(None if local else secrets.token_urlsafe(18))
+        uploads = Uploads(session.work.next_upload, session.open_mesh, session.plain)
+        frames = {PATH: Frame(uploads.page(), uploads.serve)}
         # viser prints a table of its own, and would ask the whole network in.
-        with guard.before_server(), contextlib.redirect_stdout(io.StringIO()):
+        with guard.before_server(frames), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         if not guard.installed:
             self.server.stop()
             raise UserError("studio: this version of viser cannot be guarded; install fd_mitsuba[studio] again")
         # Any client could ask for a tunnel to the internet.
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+        _refuse_files(self.server)
         self.session = session
         self.view = View(self.server, session)
         named = platform.node() if host in ("0.0.0.0", "::") else host  # all addresses is none to open
@@ -97,3 +105,11 @@ def _refuse_taken(host: str, port: int) -> None:
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UserError(f"--host {host} --port {port}: cannot be used ({reason}); give another --port") from None
+
+
+def _refuse_files(server: viser.ViserServer) -> None:
+    """Any client could send files of any size over viser's own socket, which gathers them in memory."""
+    from viser import _messages as messages
+
+    for kind in (messages.FileTransferStartUpload, messages.FileTransferPart):
+        server._websock_server.unregister_handler(kind)

@@ -1,154 +1,114 @@
-"""Files that a tab sends: put into a folder part by part, refused before their bytes are kept where they are too large.
+"""Files that a tab sends: over a connection of their own, into a folder, refused before any of their bytes are sent.
 
-viser gathers uploads of any size in memory, and tells every tab of them. This takes the place of its handlers.
+viser takes files over the socket that carries the page's clicks, which then wait, and gathers any size in memory. So
+the page has a frame with a small page of our own, `upload_page.html`, whose script talks with this as follows:
+
+    browser  {"files": [{"name": "box.obj", "size": 812}, {"name": "box.mtl", "size": 94}]}
+    server   {"received": 0}, or {"problem": "..."} and the end
+    browser  the files one after the other, in messages of at most `MOST_PART` bytes
+    server   {"received": 812} after each message, which the next one waits for
+    server   {"opened": "..."} or {"problem": "..."} when all is there and has been read
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import json
 import shutil
+import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING
 
+from fd_mitsuba.assets.readers import ARCHIVES, READERS
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.io.safe_text import safe_file_name
+from fd_mitsuba.studio.announced_files import AnnouncedFiles
+from fd_mitsuba.studio.plain_text import without_paths
 
 if TYPE_CHECKING:
-    import viser
+    from websockets.asyncio.server import ServerConnection
 
+PATH = "/upload"
+"""Of the frame's page and of its socket."""
 MOST_BYTES = 256 << 20
-"""Of one file."""
-
-
-@dataclass
-class _Transfer:
-    """One file on its way: what the tab announced, and how much of it is there."""
-
-    client: Any
-    name: str
-    size: int
-    parts: int
-    path: Path
-    stream: BinaryIO
-    next_part: int = 0
-    received: int = 0
+"""Of all files that are sent together."""
+MOST_PART = 1 << 20
+_COMPANIONS = (".mtl", ".bin", "image/*")
 
 
 class Uploads:
-    """What the tabs of a server send; each tab sends one file at a time.
+    """What the tabs send.
 
     Args:
-        new_folder: makes a folder for a file; UserError where it cannot.
-        taken: hears the tab and the path of a file that is there as a whole, from the server's own thread.
-        refused: hears the tab and why its file is not taken.
-        most: bytes of a file.
+        new_folder: makes a folder for some files; UserError where it cannot.
+        opened: hears the path of the mesh when all is there, in a thread of its own: it may take a while, and others go
+            on meanwhile. It says what is to be said, a line each; UserError where the mesh cannot be opened.
+        plain: takes paths of this machine out of a text.
+        most: bytes of files that are sent together.
     """
 
     def __init__(
         self,
-        server: viser.ViserServer,
         new_folder: Callable[[], Path],
-        taken: Callable[[Any, Path], None],
-        refused: Callable[[Any, str], None],
+        opened: Callable[[Path], list[str]],
+        plain: Callable[[str], str],
         most: int = MOST_BYTES,
     ) -> None:
-        from viser import _messages as messages
+        self._new_folder, self._opened, self._plain, self._most = new_folder, opened, plain, most
 
-        self._messages, self._server = messages, server
-        self._new_folder, self._taken, self._refused, self._most = new_folder, taken, refused, most
-        self._transfers: dict[str, _Transfer] = {}
-        interface = server._websock_server
-        for kind, handler in (
-            (messages.FileTransferStartUpload, self._begin),
-            (messages.FileTransferPart, self._part),
-        ):
-            interface.unregister_handler(kind)
-            interface.register_handler(kind, handler)
+    @staticmethod
+    def page() -> bytes:
+        """What is in the frame."""
+        text = Path(__file__).with_name("upload_page.html").read_text(encoding="utf-8")
+        accepted = ",".join([*READERS, *ARCHIVES, *_COMPANIONS])
+        return text.replace("ACCEPTED", accepted).replace("MOST_PART", str(MOST_PART)).encode()
 
-        async def gone(client: Any) -> None:  # `async`: in the thread of the handlers
-            self._gone(client)
+    async def serve(self, connection: ServerConnection) -> None:
+        """Talk with a tab's frame until its files are opened or refused."""
+        from websockets.exceptions import ConnectionClosed
 
-        server.on_client_disconnect(gone)
+        with contextlib.suppress(ConnectionClosed):  # the tab may be closed at any moment
+            try:
+                answer = {"opened": await self._taken(connection)}
+            except UserError as error:
+                answer = {"problem": " ".join(self._plain(str(error)).split())}
+            await connection.send(json.dumps(answer))
 
-    def _begin(self, client_id: int, message: Any) -> None:
-        client = self._server.get_clients().get(client_id)
-        if client is None:
-            return
-        self._gone(client)
-        if problem := self._problem(message):
-            self._refuse(client, message, problem)
-            return
+    async def _taken(self, connection: ServerConnection) -> str:
+        announced = AnnouncedFiles.read(await connection.recv(), self._most)
+        folder = self._new_folder()
         try:
-            path = self._new_folder() / safe_file_name(Path(message.filename).name)
-            stream = open(path, "wb")
-        except (OSError, UserError) as error:
-            self._refuse(client, message, str(error))
-            return
-        self._transfers[message.transfer_uuid] = _Transfer(
-            client, message.filename, message.size_bytes, message.part_count, path, stream
-        )
+            await connection.send(json.dumps({"received": 0}))
+            received = 0
+            for name, size in announced.sizes.items():
+                await self._receive(connection, folder / name, size, received)
+                received += size
+            said = await asyncio.to_thread(self._open, folder / announced.mesh)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return "; ".join([f"{announced.mesh} is the base now", *said])
 
-    def _problem(self, message: Any) -> str:
-        shown = message.filename[:80]
-        if message.size_bytes > self._most:
-            size, most = message.size_bytes >> 20, self._most >> 20
-            return f"{shown}: has {size} MB, more than {most}; reduce it, or give its path to fd_mitsuba studio"
-        if message.size_bytes <= 0 or message.part_count <= 0:
-            return f"{shown}: is empty; export the model anew"
-        return ""
-
-    def _part(self, client_id: int, message: Any) -> None:
-        transfer = self._transfers.get(message.transfer_uuid)
-        if transfer is None or transfer.client.client_id != client_id or message.part_index < transfer.next_part:
-            return
-        transfer.received += len(message.content)
-        if message.part_index > transfer.next_part or transfer.received > transfer.size:
-            self._drop(message.transfer_uuid)
-            self._refuse(transfer.client, message, f"{transfer.name[:80]}: did not arrive as it was sent; try again")
-            return
+    @staticmethod
+    async def _receive(connection: ServerConnection, path: Path, size: int, before: int) -> None:
+        """One file of `size` bytes, of which `before` have been received with earlier ones."""
         try:
-            transfer.stream.write(message.content)
+            with open(path, "wb") as file:
+                while (there := file.tell()) < size:
+                    part = await connection.recv()
+                    if isinstance(part, str) or not 0 < len(part) <= min(MOST_PART, size - there):
+                        raise UserError(f"{path.name}: did not arrive as it was announced; try again")
+                    file.write(part)
+                    await connection.send(json.dumps({"received": before + file.tell()}))
         except OSError as error:
-            self._drop(message.transfer_uuid)
-            self._refuse(transfer.client, message, f"{transfer.path}: cannot be written ({error.strerror})")
-            return
-        transfer.next_part += 1
-        if transfer.next_part < transfer.parts:
-            self._told(transfer.client, message, transfer.received, transfer.size)
-            return
-        whole = transfer.received == transfer.size
-        if whole:
-            del self._transfers[message.transfer_uuid]
-            transfer.stream.close()
-            self._told(transfer.client, message, transfer.size, transfer.size)
-            self._taken(transfer.client, transfer.path)
-        else:
-            self._drop(message.transfer_uuid)
-            self._refuse(transfer.client, message, f"{transfer.name[:80]}: did not arrive as it was sent; try again")
+            raise UserError(f"{path.name}: cannot be written ({error.strerror or error})") from None
 
-    def _told(self, client: Any, message: Any, received: int, size: int) -> None:
-        """Let the tab show how far its file is."""
-        client._websock_connection.queue_message(
-            self._messages.FileTransferPartAck(message.source_component_uuid, message.transfer_uuid, received, size)
-        )
-
-    def _refuse(self, client: Any, message: Any, problem: str) -> None:
-        """End the tab's own display of its upload, and say why."""
-        self._told(client, message, 1, 1)
-        client._websock_connection.queue_message(
-            self._messages.RemoveNotificationMessage(f"upload-{message.transfer_uuid}")
-        )
-        self._refused(client, problem)
-
-    def _gone(self, client: Any) -> None:
-        """Forget what a tab has begun to send."""
-        for key in [key for key, transfer in self._transfers.items() if transfer.client is client]:
-            self._drop(key)
-
-    def _drop(self, key: str) -> None:
-        transfer = self._transfers.pop(key)
-        with contextlib.suppress(OSError):
-            transfer.stream.close()
-        shutil.rmtree(transfer.path.parent, ignore_errors=True)
+    def _open(self, mesh: Path) -> list[str]:
+        try:
+            return self._opened(mesh)
+        except UserError as error:
+            raise UserError(without_paths(str(error), mesh.parent)) from None
+        except Exception:
+            traceback.print_exc()
+            raise UserError("that went wrong; the terminal has more about it") from None

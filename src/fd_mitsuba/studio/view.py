@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import threading
 import traceback
 from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +11,7 @@ import numpy as np
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.studio.canvas import Canvas
 from fd_mitsuba.studio.panel import AXES, Panel
-from fd_mitsuba.studio.plain_text import without_paths
 from fd_mitsuba.studio.results import download, shown_key, shown_part, whole_result
-from fd_mitsuba.studio.uploads import Uploads
 
 if TYPE_CHECKING:
     import viser
@@ -58,7 +52,6 @@ class View:
             "shading": lambda event: self._looks(self.canvas.objects.set_shading, event),
             "light": lambda event: self._looks(self._light, event),
         }
-        self.uploads = Uploads(server, session.work.next_upload, self._uploaded, self._refused)
         self.panel = Panel(server, session, self._heard, actions, self.canvas.visible)
         session.subscribe(self._told)
         for topic in ("scene", "settings", "prompt"):
@@ -155,12 +148,12 @@ class View:
         return call
 
     def _grow(self, begin: Callable[[], str]) -> None:
-        self.panel.runs.grow.disabled = True  # the check takes a moment, in which nobody shall ask twice
+        self.panel.runs.let_grow(False)  # the check takes a moment, in which nobody shall ask twice
         try:
             begin()
         finally:
             check = self.session.check
-            self.panel.runs.grow.disabled = check is not None and check.refusal is not None
+            self.panel.runs.let_grow(check is None or check.refusal is None)
 
     def _again(self) -> None:
         """Fields that hold what was refused go back to what is."""
@@ -188,25 +181,6 @@ class View:
             pose = state.regions.poses.get(state.selected)
             if pose is not None:
                 session.put(pose.moved(state.regions.frame.to_user(position), wxyz))
-
-    def _refused(self, client: Any, problem: str) -> None:
-        self._note(SimpleNamespace(client=client), self.session.plain(problem), "red")
-
-    def _uploaded(self, client: Any, path: Path) -> None:
-        """Open a file that has come, in a thread of its own: it may take a while, and others go on meanwhile."""
-        event = SimpleNamespace(client=client)
-
-        def open_it(event: Any) -> None:
-            try:
-                said = self.session.open_mesh(path)
-            except BaseException as error:
-                shutil.rmtree(path.parent, ignore_errors=True)
-                if isinstance(error, UserError):
-                    raise UserError(without_paths(str(error), path.parent)) from None
-                raise
-            self._note(event, "; ".join([f"{path.name} is the base now", *said]))
-
-        threading.Thread(target=self._heard(open_it), args=(event,), name="studio-import", daemon=True).start()
 
     def _visibility(self, event: Any) -> None:
         with self._lock:

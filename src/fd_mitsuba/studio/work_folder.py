@@ -3,8 +3,8 @@
 WORK/studio.json     regions, prompt, settings: what the page shows; written whenever it changes
 WORK/scene/          a copy of the scene with all that it reads
 WORK/scene/run_001.xml   the scene as run 001 has it, beside the same meshes
-WORK/scene_2/        after "edit again": the exported result, which is the base of the second round; or a mesh file
-WORK/uploads/001/    mesh files that were sent by the page
+WORK/scene_2/        after "edit again": the exported result, which is the base of the second round; or a mesh
+WORK/uploads/001/    a mesh and its images that were sent by the page
 WORK/runs/001/       run folders, as of `fd_mitsuba run`
 """
 
@@ -53,7 +53,7 @@ class WorkFolder:
         return self._numbered(self.runs)
 
     def next_upload(self) -> Path:
-        """A folder for the next file that the page sends, likewise."""
+        """A folder for the next files that the page sends, likewise."""
         return self._numbered(self.path / "uploads")
 
     def _numbered(self, home: Path) -> Path:
