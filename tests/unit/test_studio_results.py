@@ -24,8 +24,8 @@ from fd_mitsuba.io.ply import ply_bytes, read_ply
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.tessellate import unit_sphere
+from fd_mitsuba.studio import checks as checking
 from fd_mitsuba.studio import runner
-from fd_mitsuba.studio import session as sessions
 from fd_mitsuba.studio.adopted_run import adopt
 from fd_mitsuba.studio.base_glb import base_glb, only_parts
 from fd_mitsuba.studio.job import EventReader, EventWriter, RunOrder
@@ -220,7 +220,7 @@ def opened_with(scene: Path, work: Path, run: Path):
 
 
 def test_edit_again_makes_the_result_the_base(make_scene, mi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sessions, "live_check", lambda scene, config: LiveCheck())
+    monkeypatch.setattr(checking, "live_check", lambda scene, config: LiveCheck())
     opened = open_target(make_scene(), tmp_path / "work", {}, say=lambda line: None)
     session = Session(opened, StudioSettings("smoke"), program=(sys.executable, "-I", "-c", ""))
     name = session.grow()
@@ -230,7 +230,7 @@ def test_edit_again_makes_the_result_the_base(make_scene, mi, tmp_path: Path, mo
     (export / "animal.ply").write_bytes((tmp_path / "animal.ply").read_bytes())
     topics: list[str] = []
     session.subscribe(topics.append)
-    session.set_prompt("a pig with a tail")
+    session.edits.set_prompt("a pig with a tail")
     session.edit_again(name)
     state = session.state
     assert topics[-1] == "scene" and session.shown == "" and state.prompt == "a pig with a tail"

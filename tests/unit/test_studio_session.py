@@ -13,7 +13,7 @@ import pytest
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.load_scene import load_edit_scene
-from fd_mitsuba.studio import session as sessions
+from fd_mitsuba.studio import checks as checking
 from fd_mitsuba.studio.history import History
 from fd_mitsuba.studio.job import RunOrder
 from fd_mitsuba.studio.live_check import LiveCheck
@@ -40,7 +40,7 @@ def checks() -> None:
 @pytest.fixture(autouse=True)
 def no_check(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "checks" not in request.fixturenames:
-        monkeypatch.setattr(sessions, "live_check", lambda scene, config: LiveCheck())
+        monkeypatch.setattr(checking, "live_check", lambda scene, config: LiveCheck())
 
 
 @pytest.fixture
@@ -59,12 +59,12 @@ def test_what_a_person_does_is_heard_and_kept(session: Session, scene: Path, tmp
     topics: list[str] = []
     session.subscribe(topics.append)
     before = session.state.regions.poses["wing"]
-    session.put(replace(before, centre=(0.2, 0.3, 0.0)))
-    session.put(session.state.regions.poses["wing"])  # what a field echoes is no change
-    image = session.mirror("wing")
-    session.set_prompt("  a pig with \n a hat ")
-    session.set_prompt("a pig with a hat")
-    session.set_settings(seed=3, steps=7)
+    session.edits.put(replace(before, centre=(0.2, 0.3, 0.0)))
+    session.edits.put(session.state.regions.poses["wing"])  # what a field echoes is no change
+    image = session.edits.mirror("wing")
+    session.edits.set_prompt("  a pig with \n a hat ")
+    session.edits.set_prompt("a pig with a hat")
+    session.edits.set_settings(seed=3, steps=7)
     assert topics == ["pose", "regions", "prompt", "settings"]
     assert session.state.selected == image == "wing_mirrored"
     assert session.state.settings.config().geometry.steps == 7 and session.state.settings.config().seed == 3
@@ -76,41 +76,42 @@ def test_what_a_person_does_is_heard_and_kept(session: Session, scene: Path, tmp
 
 
 def test_a_click_puts_a_region_on_the_base(session: Session) -> None:
-    name = session.add_at([0.0, 3.0, 0.0], [0.0, -1.0, 0.0])
+    name = session.edits.add_at([0.0, 3.0, 0.0], [0.0, -1.0, 0.0])
     assert name == "region" and session.state.selected == name
     pose = session.state.regions.poses[name]
     top = session.state.scene.base_canonical.vertices[:, 1].max()
     height = session.state.scene.frame.to_canonical(np.array(pose.centre))[1]
     assert height < top + 0.25 and pose.part == "part"
-    assert session.add_at([0.0, 3.0, 0.0], [0.0, 1.0, 0.0]) is None
-    assert session.add() == "region_2"
+    assert session.edits.add_at([0.0, 3.0, 0.0], [0.0, 1.0, 0.0]) is None
+    assert session.edits.add() == "region_2"
 
 
 def test_check_reads_the_prompt_and_refuses(session: Session, checks: None) -> None:
-    session.set_prompt("a pig with wings")
-    fine = session.check_now()
-    assert fine.refusal is None and "wing" in fine.told and "s for the shape" in fine.estimate
+    session.edits.set_prompt("a pig with wings")
+    fine = session.checks.now()
+    assert fine.refusal is None and "wing" in fine.told
+    assert re.search(r"\d (s|min) for the shape", fine.estimate)  # slower on a busy machine
     assert fine.regions[0].startswith("wing: touches the base, 100% in the grid") and "of room above" in fine.regions[0]
-    session.set_prompt("a pig with a submarine")
+    session.edits.set_prompt("a pig with a submarine")
     with pytest.raises(UserError, match="the built-in prior knows no"):
         session.grow()
-    session.set_prompt(" ")
-    assert "prompt is blank" in str(session.check_now().refusal)
+    session.edits.set_prompt(" ")
+    assert "prompt is blank" in str(session.checks.now().refusal)
     with pytest.raises(UserError, match="prompt is blank"):
         session.save_scene()
-    session.set_prompt("a pig with wings")
+    session.edits.set_prompt("a pig with wings")
     wing = session.state.regions.poses["wing"]
-    session.put(replace(wing, centre=(0.0, 0.6, 0.0)))
-    assert "100% in the grid" in session.check_now().regions[0]  # the grid makes room
-    session.put(replace(wing, centre=(0.0, 40.0, 0.0)))
-    assert "lies in the editable cube" in str(session.check_now().refusal)
+    session.edits.put(replace(wing, centre=(0.0, 0.6, 0.0)))
+    assert "100% in the grid" in session.checks.now().regions[0]  # the grid makes room
+    session.edits.put(replace(wing, centre=(0.0, 40.0, 0.0)))
+    assert "lies in the editable cube" in str(session.checks.now().refusal)
     with pytest.raises(UserError, match="move or shrink it"):
         session.grow()
     assert not session.queue.runs
 
 
 def test_grow_makes_an_order_that_can_be_run_by_itself(session: Session, scene: Path) -> None:
-    session.put(replace(session.state.regions.poses["wing"], centre=(0.1, 0.35, 0.0)))
+    session.edits.put(replace(session.state.regions.poses["wing"], centre=(0.1, 0.35, 0.0)))
     first = session.grow()
     second = session.another_seed()
     assert (first, second) == ("001", "002") and session.shown == second
@@ -126,8 +127,8 @@ def test_grow_makes_an_order_that_can_be_run_by_itself(session: Session, scene: 
 def test_save_scene_keeps_everything_else(session: Session, scene: Path) -> None:
     before = scene.read_text()
     assert session.save_scene() == "scene.xml has all that already"
-    session.put(replace(session.state.regions.poses["wing"], radii=(0.2, 0.2, 0.2)))
-    session.set_prompt("a pig with a horn")
+    session.edits.put(replace(session.state.regions.poses["wing"], radii=(0.2, 0.2, 0.2)))
+    session.edits.set_prompt("a pig with a horn")
     assert session.save_scene() == "saved in scene.xml"
     after = scene.read_text()
     assert (
@@ -145,7 +146,7 @@ def test_save_scene_keeps_everything_else(session: Session, scene: Path) -> None
 def test_save_scene_refuses_regions_that_changed_in_the_file(session: Session, scene: Path) -> None:
     scene.write_text(scene.read_text().replace('y="0.35"', 'y="0.4"'))
     before = scene.read_bytes()
-    session.set_prompt("a pig with a horn")
+    session.edits.set_prompt("a pig with a horn")
     with pytest.raises(UserError, match="regions were changed since it was opened here; open it again"):
         session.save_scene()
     assert scene.read_bytes() == before
@@ -154,16 +155,16 @@ def test_save_scene_refuses_regions_that_changed_in_the_file(session: Session, s
 def test_a_scene_without_regions_gets_its_first_one_here(make_scene, mi, tmp_path: Path, checks: None) -> None:
     scene = make_scene(region="")
     session = opened(scene, tmp_path / "work")
-    assert session.state.selected == "" and "no region yet" in str(session.check_now().refusal)
-    session.add()
-    session.set_prompt("a pig with a horn")
+    assert session.state.selected == "" and "no region yet" in str(session.checks.now().refusal)
+    session.edits.add()
+    session.edits.set_prompt("a pig with a horn")
     session.save_scene()
     session.close()
     assert [region.name for region in load_edit_scene(scene).regions] == ["region"]
 
 
 def test_scene_that_was_edited_meanwhile_is_taken_anew(session: Session, scene: Path, tmp_path: Path) -> None:
-    session.set_prompt("a pig with a horn")
+    session.edits.set_prompt("a pig with a horn")
     session.save()
     scene.write_text(scene.read_text().replace("two wings", "a tail"))
     again = opened(scene, tmp_path / "work")
@@ -176,7 +177,7 @@ def test_scene_that_was_edited_meanwhile_is_taken_anew(session: Session, scene: 
 
 
 def test_work_folder_is_enough_to_start_again(session: Session, scene: Path, tmp_path: Path) -> None:
-    session.set_prompt("a pig with a horn")
+    session.edits.set_prompt("a pig with a horn")
     name = session.grow()
     session.queue.stop(name)
     session.close()
@@ -221,50 +222,50 @@ def test_no_path_of_the_disk_is_shown(session: Session, tmp_path: Path, checks: 
     line = f"{tmp_path}/my files/scene.xml:3: <shape>: {tmp_path}/files/scene/a.ply is gone, see https://x.org/a/b"
     shown = without_paths(line, tmp_path / "my files")
     assert shown == "scene.xml:3: <shape>: a.ply is gone, see https://x.org/a/b"
-    session.set_prompt("a pig with a submarine")
-    report = session.check_now()
+    session.edits.set_prompt("a pig with a submarine")
+    report = session.checks.now()
     for text in (str(report.refusal), *report.warnings, *report.regions):
         assert not re.search(r"(^|\s)/\w+/", session.plain(text))
 
 
 def test_undo_and_redo(session: Session) -> None:
-    session._history = History(clock=iter(range(0, 1000, 10)).__next__)  # nothing follows at once
+    session.edits._history = History(clock=iter(range(0, 1000, 10)).__next__)  # nothing follows at once
     first = session.state.regions.poses["wing"]
     moved = replace(first, centre=(0.2, 0.3, 0.0))
-    session.put(moved)
-    image = session.mirror("wing")
-    session.set_prompt("a pig with a hat")
-    session.remove(image)
+    session.edits.put(moved)
+    image = session.edits.mirror("wing")
+    session.edits.set_prompt("a pig with a hat")
+    session.edits.remove(image)
     topics: list[str] = []
     session.subscribe(topics.append)
-    session.undo()
+    session.edits.undo()
     assert list(session.state.regions.poses) == ["wing", image] and session.state.selected == image
     assert topics == ["prompt", "regions"]
-    session.undo()
+    session.edits.undo()
     assert session.state.prompt == "a pig with two wings"
-    session.undo()
-    session.undo()
+    session.edits.undo()
+    session.edits.undo()
     assert session.state.regions.poses == {"wing": first}
     with pytest.raises(UserError, match="nothing to undo"):
-        session.undo()
+        session.edits.undo()
     for _ in range(3):
-        session.redo()
+        session.edits.redo()
     assert session.state.prompt == "a pig with a hat" and session.state.regions.poses["wing"] == moved
-    session.put(first)  # another way from here
+    session.edits.put(first)  # another way from here
     with pytest.raises(UserError, match="nothing to redo"):
-        session.redo()
+        session.edits.redo()
 
 
 def test_a_drag_is_one_change_to_undo(session: Session) -> None:
     times = iter([0.0, 0.1, 0.2, 5.0])
-    session._history = History(clock=times.__next__)
+    session.edits._history = History(clock=times.__next__)
     first = session.state.regions.poses["wing"]
     for x in (0.1, 0.2, 0.3):
-        session.put(replace(first, centre=(x, 0.3, 0.0)))
-    session.put(replace(first, centre=(0.9, 0.3, 0.0)))
-    session.undo()
+        session.edits.put(replace(first, centre=(x, 0.3, 0.0)))
+    session.edits.put(replace(first, centre=(0.9, 0.3, 0.0)))
+    session.edits.undo()
     assert session.state.regions.poses["wing"].centre[0] == 0.3
-    session.undo()
+    session.edits.undo()
     assert session.state.regions.poses["wing"] == first
 
 

@@ -290,7 +290,7 @@ def test_a_mesh_file_becomes_the_base_of_another_round(
     assert panel.radii[0].max == pytest.approx(0.6 * 2) and small < 1 and panel.radii[0].value == pytest.approx(0.3)
     kept = session.work.path / "uploads" / "001" / "red box.glb"
     assert kept.read_bytes() == (ASSETS / "box.glb").read_bytes()
-    session.set_prompt("a box with a hat")
+    session.edits.set_prompt("a box with a hat")
     name = session.grow()
     assert (session.queue.runs[name].folder / "../../scene_2/run_001.xml").is_file()
 

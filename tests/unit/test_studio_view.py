@@ -94,7 +94,7 @@ def test_growing_part_is_shown(view: View) -> None:
         events.write("step", stage="geometry", phase="coarse", step=step, total=4, losses=losses)
     events.write("mesh", step=1, faces=len(faces))
     run.follow()
-    session._tell("runs")
+    session.tell("runs")
     shown = view.canvas.objects._shown["part"].handle
     assert shown.vertices == pytest.approx(session.state.regions.frame.to_canonical(vertices), abs=1e-6)
     assert "geometry, step 2 of 4" in view.panel.runs.status.content and view.panel.runs.bar.value == 50
@@ -135,19 +135,19 @@ def test_a_part_has_words_of_its_own(view: View) -> None:
     state, client = view.session.state, Client()
     typed(view.panel.part_prompt, " bat  wings", client)
     assert state.regions.poses["wing"].prompt == "bat wings" and view.panel.part_prompt.value == " bat  wings"
-    check = view.session.check_now()
+    check = view.session.checks.now()
     assert "bat wings" in check.understood or "part: " in check.understood
-    name = view.session.mirror("wing", 1)
+    name = view.session.edits.mirror("wing", 1)
     assert view.panel.region.value == name and view.panel.part_prompt.value.split() == ["bat", "wings"]
-    view.session.undo()
-    view.session.undo()
+    view.session.edits.undo()
+    view.session.edits.undo()
     assert view.panel.part_prompt.value == ""
 
 
 def test_selected_region_leaves_clicks_to_its_gizmo(view: View) -> None:
-    name = view.session.mirror("wing", 1)
+    name = view.session.edits.mirror("wing", 1)
     assert view.canvas._clickable == {"wing"} and view.panel.region.value == name
-    view.session.select("wing")
+    view.session.edits.select("wing")
     assert view.canvas._clickable == {name}
 
 
@@ -174,6 +174,6 @@ def test_a_finished_result_stands_beside(view: View) -> None:
 def test_buttons_undo_what_was_done(view: View) -> None:
     client, state = Client(), view.session.state
     typed(view.panel.radii[1], 0.4, client)
-    view.session.undo()
+    view.session.edits.undo()
     assert state.regions.poses["wing"].radii == pytest.approx((0.12, 0.25, 0.15))
     assert view.panel.radii[1].value == pytest.approx(0.25, abs=1e-3)

@@ -77,14 +77,14 @@ class Panel(ActionPanel):
         self.prompt = self._gui.add_text(
             "Prompt", self.session.state.prompt, hint="what the edited object should look like"
         )
-        self.prompt.on_update(self._heard(lambda event: self.session.set_prompt(event.target.value)))
+        self.prompt.on_update(self._heard(lambda event: self.session.edits.set_prompt(event.target.value)))
         self.reading = self._gui.add_markdown("")
 
     def _region(self) -> None:
         session, state, actions = self.session, self.session.state, self._actions
         names = list(state.regions.poses) or ["-"]
         self.region = self._gui.add_dropdown("Region", names, initial_value=state.selected or names[0])
-        self.region.on_update(self._heard(lambda event: session.select(event.target.value)))
+        self.region.on_update(self._heard(lambda event: session.edits.select(event.target.value)))
         self.part = self._gui.add_text("Part", "part", hint="regions of one part grow together")
         self.part_prompt = self._gui.add_text(
             "Its prompt", "", hint="what this part alone should be, as in 'a hat'; blank: the prompt above says it"
@@ -118,7 +118,7 @@ class Panel(ActionPanel):
             radii = pose.radii if same else radii
             words = " ".join(self.part_prompt.value.split())
             named = replace(pose, part=self.part.value.strip() or pose.part, prompt=words)
-            self.session.put(replace(named, centre=centre, radii=radii))
+            self.session.edits.put(replace(named, centre=centre, radii=radii))
 
     def show_regions(self) -> None:
         """Names and the selected region's numbers; another base has another range of radii."""

@@ -51,7 +51,9 @@ class RunPanel(ActionPanel):
         for name in ("preset", "seed", "steps"):
             field = getattr(self, name)
             field.on_update(
-                self._heard(lambda event, name=name: self.session.set_settings(**{name: _whole(event.target.value)}))
+                self._heard(
+                    lambda event, name=name: self.session.edits.set_settings(**{name: _whole(event.target.value)})
+                )
             )
         self.estimate = self._gui.add_markdown("")
         self.grow = self._button("Grow", "grow", color="green", icon="plant")

@@ -33,12 +33,12 @@ class View:
         self._whole = False
         self.canvas = Canvas(server, self._clicked_region, self._gizmo_moved, self._clicked_base)
         actions: dict[str, Callable[[Any], object]] = {
-            "mirror": lambda event: session.mirror(session.state.selected, AXES[self.panel.axis.value]),
+            "mirror": lambda event: session.edits.mirror(session.state.selected, AXES[self.panel.axis.value]),
             "pick": self._pick,
-            "add": lambda event: session.add(),
-            "undo": lambda event: session.undo(),
-            "redo": lambda event: session.redo(),
-            "remove": lambda event: session.remove(session.state.selected),
+            "add": lambda event: session.edits.add(),
+            "undo": lambda event: session.edits.undo(),
+            "redo": lambda event: session.edits.redo(),
+            "remove": lambda event: session.edits.remove(session.state.selected),
             "grow": lambda event: self._grow(session.grow),
             "another_seed": lambda event: self._grow(session.another_seed),
             "save": lambda event: self._note(event, session.save_scene()),
@@ -95,10 +95,10 @@ class View:
             panel.show_prompt()
         if topic == "settings":
             panel.runs.show_settings()
-        if topic == "check" and session.check is not None:
-            panel.show_check(session.check)
-            if session.check.grid is not None:
-                canvas.show_grid(*(frame.to_canonical(np.array(corner)) for corner in session.check.grid))
+        if topic == "check" and session.checks.newest is not None:
+            panel.show_check(session.checks.newest)
+            if session.checks.newest.grid is not None:
+                canvas.show_grid(*(frame.to_canonical(np.array(corner)) for corner in session.checks.newest.grid))
         if topic in ("scene", "runs"):
             panel.runs.show_runs()
             self._show_part()
@@ -152,7 +152,7 @@ class View:
         try:
             begin()
         finally:
-            check = self.session.check
+            check = self.session.checks.newest
             self.panel.runs.let_grow(check is None or check.refusal is None)
 
     def _again(self) -> None:
@@ -168,11 +168,11 @@ class View:
         self._note(event, "click on the base to put the region there")
 
     def _clicked_region(self, name: str) -> None:
-        self.session.select(name)
+        self.session.edits.select(name)
 
     def _clicked_base(self, event: Any) -> None:
         self.canvas.picking(False)
-        self.session.add_at(event.ray_origin, event.ray_direction)
+        self.session.edits.add_at(event.ray_origin, event.ray_direction)
 
     def _gizmo_moved(self, position: np.ndarray, wxyz: np.ndarray) -> None:
         session = self.session
@@ -180,7 +180,7 @@ class View:
             state = session.state
             pose = state.regions.poses.get(state.selected)
             if pose is not None:
-                session.put(pose.moved(state.regions.frame.to_user(position), wxyz))
+                session.edits.put(pose.moved(state.regions.frame.to_user(position), wxyz))
 
     def _visibility(self, event: Any) -> None:
         with self._lock:
