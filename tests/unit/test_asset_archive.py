@@ -96,7 +96,7 @@ def encrypted() -> bytes:
 BOX = (ASSETS / "box.glb").read_bytes()
 REFUSED = {
     "no ZIP": (b"hello", "is no ZIP"),
-    "empty": (b"", "is no ZIP"),
+    "empty": (b"", "is empty"),
     "cut short": (packed({"box.glb": BOX})[:-40], "is no ZIP|cannot be unpacked"),
     "nothing in it": (packed({}), "holds no mesh"),
     "no mesh": (packed({"readme.txt": b"hello"}), "holds no mesh .*GLB"),

@@ -215,7 +215,7 @@ def test_files_that_must_not_be_opened_are_refused_in_a_line(session: Session, s
         ({"../../model.glb": image_of("file:///etc/passwd")}, "model.glb: .*lies outside its folder"),
         ({"model.glb": image_of(png_bomb())}, "model.glb: .*has 100000 x 100000 pixels, more than 134 million; shrink"),
         ({"model.glb": b"glTF" + bytes(40)}, "model.glb: is a GLB of version 0"),
-        ({"model.glb": b""}, "model.glb: is no glTF"),
+        ({"model.glb": b""}, "model.glb: is empty"),
         ({"thesis.tex": b"words"}, "thesis.tex: .tex is not read"),
         ({}, "no file was chosen"),
         ({"a.mtl": b"", "b.png": b""}, "what was sent holds no mesh"),
@@ -286,6 +286,7 @@ def test_a_mesh_file_becomes_the_base_of_another_round(
     assert (state.source.round, state.prompt, list(state.regions.poses)) == (2, "a red box", ["head"])
     assert np.ptp(state.scene.base[0].vertices, axis=0) == pytest.approx([2, 2, 2])
     other.until(lambda row: row["type"] == "GlbMessage" and row["name"] == "/base")
+    assert "write what to add, as in 'a red box with a hat'" in str(session.checks.now().refusal)
     assert panel.prompt.value == "a red box" and panel.region.value == "head"
     assert panel.radii[0].max == pytest.approx(0.6 * 2) and small < 1 and panel.radii[0].value == pytest.approx(0.3)
     kept = session.work.path / "uploads" / "001" / "red box.glb"

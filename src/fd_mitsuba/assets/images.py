@@ -67,7 +67,7 @@ def read_image(path: Path) -> TextureImage:
     try:
         data = read_regular(path, MOST_BYTES)
     except NotReadable as error:
-        raise BrokenAsset(f"its image {path.name!r} {error}") from None
+        raise BrokenAsset(f"its image {path.name!r} {error}; keep the asset's files together") from None
     return checked_image(path.stem, data)
 
 

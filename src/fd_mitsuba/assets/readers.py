@@ -69,7 +69,10 @@ def read_named(path: Path) -> Asset:
     reader = (READERS | ARCHIVES).get(suffix)
     if reader is None:
         known = formats_in_words((*READERS, *ARCHIVES))
-        raise BrokenAsset(f"{suffix or 'no suffix'} is not read ({known} are); export it as GLB, as from Blender")
+        shown = suffix or "a name without a suffix"
+        raise BrokenAsset(f"{shown} is not read ({known} are); export it as GLB, as from Blender")
+    if path.is_file() and path.stat().st_size == 0:
+        raise BrokenAsset("is empty; export the model anew")
     try:
         return reader(path)
     except (ValueError, IndexError, KeyError, TypeError, OverflowError, RecursionError) as error:

@@ -53,7 +53,7 @@ def live_check(scene: EditScene, config: RunConfig) -> LiveCheck:
         return LiveCheck(refusal or str(error))
     reading, parts = report.prompt_reading, report.part_readings
     return LiveCheck(
-        refusal or report.refusal,
+        refusal or _prompt_refusal(scene, report),
         "; ".join(
             [] if reading is None else [reading.summary(), *(f"{name}: {p.summary()}" for name, p in parts.items())]
         ),
@@ -63,6 +63,13 @@ def live_check(scene: EditScene, config: RunConfig) -> LiveCheck:
         (report.cost.seconds_total, report.cost.appearance_seconds_total),
         (report.grid_low, report.grid_high),
     )
+
+
+def _prompt_refusal(scene: EditScene, report: CheckReport) -> str | None:
+    """Why a run would not take the prompt; in words of its own for the one that an imported mesh starts with."""
+    if report.refusal is not None and scene.prompt == scene.base_prompt:
+        return f"the prompt says only what is there; write what to add, as in '{scene.prompt} with a hat'"
+    return report.refusal
 
 
 def _misplaced(scene: EditScene) -> str | None:

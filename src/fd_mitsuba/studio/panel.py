@@ -6,6 +6,7 @@ drive each other in circles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -143,7 +144,7 @@ class Panel(ActionPanel):
         for slider, radius in zip(self.radii, pose.radii, strict=True):
             if radius > slider.max:
                 slider.max = _even(radius * 1.2)
-            slider.value = max(radius, slider.min)
+            slider.value = max(round(radius, _digits(slider.step)), slider.min)
 
     def show_prompt(self) -> None:
         """The prompt as the session has it; blanks that a person is typing stay."""
@@ -166,6 +167,11 @@ def _range_of_radii(scale: float) -> tuple[float, float, float]:
     """Least, most and step of a radius in user units, for a base that is so much smaller in the canonical frame."""
     longest = BASE_LONGEST_SIDE / scale
     return _even(longest / 200), _even(longest * 0.6), longest / 1e4
+
+
+def _digits(step: float) -> int:
+    """Behind the decimal point, as many as it takes to tell one step from the next: more do not fit into the field."""
+    return max(0, -math.floor(math.log10(step)))
 
 
 def _even(value: float) -> float:
