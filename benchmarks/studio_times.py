@@ -15,8 +15,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import re
-import signal
 import subprocess
 import sys
 import tempfile
@@ -27,10 +25,11 @@ import numpy as np
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
+sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tools"), str(ROOT / "src")]
 
 from export_part import lumpy_ball  # noqa: E402
 from machine import print_figures  # noqa: E402
+from studio_process import driven, served  # noqa: E402
 
 from fd_mitsuba.config import settings_for_run  # noqa: E402
 from fd_mitsuba.export.gltf import GltfMesh, glb_bytes  # noqa: E402
@@ -60,19 +59,8 @@ def textured_ball(path: Path) -> None:
 
 def page(action: str, target: Path, folder: Path, options: dict[str, Any]) -> dict[str, Any]:
     """What the driven page measured of a studio that is started on a scene or mesh file."""
-    command = [sys.executable, "-m", "fd_mitsuba", "studio", str(target), "--port", "0", "-o", str(folder / "work")]
-    server = subprocess.Popen([*command, "--prompt", options["prompt"]], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    try:
-        assert server.stdout is not None
-        lines = iter(server.stdout.readline, "")
-        found = next((match for line in lines if (match := re.search(r"http://\S+(?=,)", line))), None)
-        assert found is not None, "the studio did not start"
-        script = ROOT / "tools" / "viewers" / "studio_page.mjs"
-        command = ["node", str(script), action, found[0], str(folder), json.dumps(options)]
-        return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    finally:
-        server.send_signal(signal.SIGINT)
-        server.wait()
+    with served(target, folder / "work", "--prompt", options["prompt"]) as url:
+        return driven("studio_page.mjs", action, url, folder, options=options)
 
 
 def step_seconds(folder: Path, live: bool, steps: int) -> dict[str, float]:

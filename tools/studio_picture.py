@@ -7,34 +7,21 @@ Needs chromium, `npm install` in tools/viewers, and viser. SECONDS is how long t
 
 from __future__ import annotations
 
-import json
-import re
-import signal
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from PIL import Image
+from studio_process import ROOT, driven, served
 
-ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "images" / "studio.jpg"
 
 
 def main(seconds: float) -> None:
+    options = {"prompt": "a cat with a crown", "told": "cat with a crown", "look": 1000 * seconds}
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "fd_mitsuba", "studio", "scenes/cat/scene.xml", "--port", "0"]
-        server = subprocess.Popen([*command, "-o", f"{folder}/work"], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-        try:
-            assert server.stdout is not None
-            found = re.search(r"http://\S+(?=,)", server.stdout.readline())
-            assert found is not None, "the studio did not start"
-            options = {"prompt": "a cat with a crown", "told": "cat with a crown", "look": 1000 * seconds}
-            script = ROOT / "tools" / "viewers" / "studio_page.mjs"
-            subprocess.run(["node", str(script), "grow", found[0], folder, json.dumps(options)], check=True)
-        finally:
-            server.send_signal(signal.SIGINT)
-            server.wait()
+        with served("scenes/cat/scene.xml", Path(folder) / "work") as url:
+            driven("studio_page.mjs", "grow", url, folder, options=options)
         Image.open(f"{folder}/growing.png").convert("RGB").save(PICTURE, quality=85, optimize=True)
     print(f"{PICTURE}: {PICTURE.stat().st_size // 1024} KB")
 

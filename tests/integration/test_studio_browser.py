@@ -22,6 +22,9 @@ from viewer_setup import VIEWERS, glb_faults, needs_browser
 
 from fd_mitsuba.io.glb import glb_content
 
+sys.path.append(str(VIEWERS.parent))
+from studio_process import upward_drag  # noqa: E402
+
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800), needs_browser]
 WIDTH, HEIGHT = 1280, 860
 STEPS = 120
@@ -55,19 +58,6 @@ def driven(action: str, url: str, folder: Path, **options: Any) -> dict[str, Any
     return found
 
 
-def on_screen(point: np.ndarray) -> tuple[float, float]:
-    """Pixel of a point (3,) of the canonical frame, seen by the page's first camera."""
-    from fd_mitsuba.studio.canvas import CAMERA, FOV_DEG
-
-    eye = np.array(CAMERA)
-    back = eye / np.linalg.norm(eye)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    away = point - eye
-    reach = HEIGHT / 2 / np.tan(np.radians(FOV_DEG) / 2) / -(away @ back)
-    return WIDTH / 2 + reach * (away @ right), HEIGHT / 2 - reach * (away @ np.cross(back, right))
-
-
 def until(condition: Callable[[], bool], seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not condition():
@@ -89,12 +79,9 @@ def test_grow_kill_resume_download(make_scene: Callable[..., Path], tmp_path: Pa
         record = json.loads((work / "studio.json").read_text())
         start = np.array(record["regions"][0]["centre"])
         from fd_mitsuba.scene.load_scene import load_edit_scene
-        from fd_mitsuba.studio.canvas import GIZMO_SCALE
 
         frame = load_edit_scene(scene).frame
-        axis = np.array([0.0, 0.8 * GIZMO_SCALE, 0.0])
-        centre = frame.to_canonical(start)
-        ends = [on_screen(centre + axis), on_screen(centre + axis + [0, 0.1, 0])]
+        ends = upward_drag(frame.to_canonical(start), 0.1, WIDTH, HEIGHT)
         seen = driven(
             "grow", served.url, tmp_path, drag=ends, prompt="a pig with a pointed hat", told="with a pointed hat",
             steps=STEPS, tabs=2,

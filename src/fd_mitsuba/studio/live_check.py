@@ -9,6 +9,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.check import check_scene
 from fd_mitsuba.runs.check_report import CheckReport
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.headroom import FITS
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.region_place import gap_to_base, misplacement
 
@@ -88,7 +89,8 @@ def _regions(scene: EditScene, report: CheckReport) -> list[str]:
         touch = "touches the base" if found.gap_to_base == 0 else f"{found.gap_to_base:.3g} away from the base"
         top = float(scene.frame.to_user(region.bounds[1])[1])
         room = report.grid_high[1] - top
-        above = f"{room:.3g} of room above" if room >= 0 else f"{-room:.3g} too high for the grid"
+        too_high = f"{-room:.3g} too high for the grid" if found.share_in_grid < FITS else "no room above"
+        above = f"{room:.3g} of room above" if room >= 0 else too_high
         inside = f"{found.share_in_base:.0%} inside the base"
         lines.append(f"{found.name}: {touch}, {found.share_in_grid:.0%} in the grid, {inside}, {above}")
     return lines
