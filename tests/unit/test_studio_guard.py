@@ -5,11 +5,12 @@ from __future__ import annotations
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.studio.guard import COOKIE, Guard, is_local
+from fd_mitsuba.studio.guard import COOKIE, Frame, Guard, is_local
 
 LOCAL = {"Host": "127.0.0.1:8080"}
 AWAY = {"Host": "10.0.0.7:8080"}
@@ -49,7 +50,11 @@ def test_loopback_names() -> None:
 def page() -> Iterator[tuple[Guard, int]]:
     viser = pytest.importorskip("viser")
     guard = Guard("secret")
-    with guard.before_server():
+
+    async def talk(connection: Any) -> None:
+        await connection.send("hello")
+
+    with guard.before_server({"/frame": Frame(b"<p>mine", talk)}):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield guard, server.get_port()
     server.stop()
@@ -72,6 +77,25 @@ def test_viser_is_behind_the_guard(page: tuple[Guard, int]) -> None:
     assert ask(port, Cookie=f"{COOKIE}=secret")[0] == 200
     websocket = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
     assert ask(port, **websocket, **{"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="})[0] == 403
+
+
+def test_a_frame_is_behind_the_guard_and_within_our_pages_alone(page: tuple[Guard, int]) -> None:
+    port = page[1]
+    assert ask(port, "/frame")[0] == 403
+    for path, body, framing in (("/frame", b"<p>mine", "SAMEORIGIN"), ("/", b"<!doctype html>", "DENY")):
+        request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers={"Cookie": f"{COOKIE}=secret"})
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            assert answer.read()[: len(body)].lower() == body and answer.headers["X-Frame-Options"] == framing
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    address = f"ws://127.0.0.1:{port}/frame"
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(address)
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(f"{address}?token=secret", origin="https://evil.org")  # type: ignore[arg-type]
+    with connect(f"{address}?token=secret") as socket:
+        assert socket.recv(timeout=20) == "hello"
 
 
 def test_taken_port_is_refused(page: tuple[Guard, int]) -> None:
