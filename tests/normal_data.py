@@ -16,10 +16,12 @@ from torch import Tensor
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.choice import Choice
+from fd_mitsuba.guidance.chunk import Beside, Chunk
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.loading import Components
 from fd_mitsuba.guidance.model_conventions import ModelConventions
-from fd_mitsuba.guidance.variants import VARIANTS, Chunk, Distillation
+from fd_mitsuba.guidance.query import Distillation
+from fd_mitsuba.guidance.variants import VARIANTS
 
 SIGMA = 0.5
 TEXT, FREE = 0.8, -0.3
@@ -94,7 +96,7 @@ def chunk(*timesteps: int, mask: Tensor | None = None, base: float | None = None
     states = {"text": TEXT, "image": FREE, "plain": FREE}
     texts = {name: torch.full((count, 2, 3), value, dtype=torch.float64) for name, value in states.items()}
     condition = None if base is None else torch.full((count, 4, 4, 4), base / 4, dtype=torch.float64)
-    return Chunk(z, noise, torch.tensor(timesteps), texts, condition, mask)
+    return Chunk(z, noise, torch.tensor(timesteps), texts, Beside(condition), mask)
 
 
 def level(*timesteps: int) -> Tensor:

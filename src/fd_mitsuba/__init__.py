@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from fd_mitsuba.errors import Interrupted, RunStopped, UserError
     from fd_mitsuba.export.formats import EXPORTERS, Exporter
     from fd_mitsuba.guidance.interface import GuidanceResult
+    from fd_mitsuba.guidance.query import Variant
     from fd_mitsuba.guidance.sources import GUIDANCES
-    from fd_mitsuba.guidance.variants import VARIANTS, Variant
+    from fd_mitsuba.guidance.variants import VARIANTS
     from fd_mitsuba.scene.region_shapes import REGION_SHAPES
     from fd_mitsuba.training.appearance_losses import APPEARANCE_LOSSES, AppearanceLoss
     from fd_mitsuba.training.geometry_losses import GEOMETRY_LOSSES, FieldLoss
@@ -66,7 +67,7 @@ _PLACES = {
     "Section": ("fd_mitsuba.config", "Section"),
     "UserError": ("fd_mitsuba.errors", "UserError"),
     "VARIANTS": ("fd_mitsuba.guidance.variants", "VARIANTS"),
-    "Variant": ("fd_mitsuba.guidance.variants", "Variant"),
+    "Variant": ("fd_mitsuba.guidance.query", "Variant"),
     "demo_scene": ("fd_mitsuba.api", "demo_scene"),
     "edit": ("fd_mitsuba.api", "edit"),
     "evaluate": ("fd_mitsuba.api", "evaluate"),

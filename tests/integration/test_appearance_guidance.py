@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from tiny_guidance import components_of
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.config import GuidanceConfig
@@ -35,11 +35,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     torch.save({"average": average, "kind": "appearance"}, root / "checkpoint.pt")
     pack(root / "checkpoint.pt", root / "builtin")
     return made | {"builtin": root / "builtin"}
-
-
-@cache
-def components_of(folder: Path) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder)))
 
 
 def load(folder: Path, variant: str = "sds", **appearance: object) -> DiffusionGuidance:

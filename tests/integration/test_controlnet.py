@@ -19,6 +19,7 @@ from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews
 from fd_mitsuba.training.record import read_metrics
@@ -85,9 +86,11 @@ def test_a_step_with_a_controlnet_equals_the_pipelines_own(
         controlnet_conditioning_scale=0.6,
         output_type="latent",
     ).images
-    texts = {"text": guidance._embed(["a horse with wings"]), "plain": guidance._embed(["blurry"])}
+    texts = {"text": guidance.texts.embed(["a horse with wings"]), "plain": guidance.texts.embed(["blurry"])}
     with torch.no_grad():
-        with_it, without = (guidance.predict_noise(z_t, t, texts, None, seen) for seen in (views.control[:1], None))
+        with_it, without = (
+            guidance.predict_noise(z_t, t, texts, Beside(control=seen)) for seen in (views.control[:1], None)
+        )
     noise = with_it["plain"] + 7.5 * (with_it["text"] - with_it["plain"])
     torch.testing.assert_close(result, pipeline.scheduler.step(noise, t[0], z_t).prev_sample, rtol=1e-4, atol=1e-4)
     assert not torch.allclose(with_it["text"], without["text"], atol=1e-2)
@@ -97,7 +100,7 @@ def test_the_gradient_with_a_controlnet_by_hand(
     root: Path, pipeline: diffusers.StableDiffusionControlNetPipeline
 ) -> None:
     guidance, views = load(root), lit_views()
-    t, noise = guidance._draw(2, 0, 10, "appearance", 3)
+    t, noise = guidance.draws.of_step(2, 0, 10, "appearance", 3)
     z = guidance.encode(views.pictures, "appearance")
     z_t = pipeline.scheduler.add_noise(z.detach(), noise, t)
     seen = []

@@ -7,18 +7,19 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import diffusers
 import pytest
 import safetensors.torch
 import torch
+from tiny_guidance import load
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import builtin, loading, memory
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews, NonFiniteGuidance
 
@@ -39,18 +40,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(autouse=True)
 def offline(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-
-
-@cache
-def components_of(folder: Path, dtype: str) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder), dtype=dtype))
-
-
-def load(folder: Path, **settings: object) -> DiffusionGuidance:
-    config = GuidanceConfig(model=str(folder), **settings)
-    guidance = DiffusionGuidance(components_of(folder, config.dtype), config)
-    guidance.set_prompt("a horse with wings", "blurry")
-    return guidance
 
 
 def views_for(guidance: DiffusionGuidance, phase: str, count: int = 4, seed: int = 0) -> GuidanceViews:
@@ -165,8 +154,11 @@ def test_noise_equals_the_pipelines_own(folders: dict[str, Path], kind: str) -> 
         outputs = pipeline.unet(z_t.repeat(2, 1, 1, 1), t.repeat(2), torch.cat([negative, text])).sample
         plain, conditioned = outputs.chunk(2)
         output = plain + 7.5 * (conditioned - plain)
-        embeddings = {"text": guidance._embed(["a horse", "wings"]), "plain": guidance._embed(["blurry", "blurry"])}
-        passes = guidance.predict_noise(z_t, t, embeddings, None)
+        embeddings = {
+            "text": guidance.texts.embed(["a horse", "wings"]),
+            "plain": guidance.texts.embed(["blurry", "blurry"]),
+        }
+        passes = guidance.predict_noise(z_t, t, embeddings)
     got = 7.5 * passes["text"] - 6.5 * passes["plain"]
     if kind == "sd21":  # the scheduler's own step tells the noise that it took v for
         for row in range(2):
@@ -201,10 +193,12 @@ def test_instruct_pix2pix_step_equals_the_pipelines_own(folders: dict[str, Path]
         latents=z_t,
         output_type="latent",
     ).images
-    texts = {"text": guidance._embed(["a horse"])} | {n: guidance._embed(["blurry"]) for n in ("image", "plain")}
+    texts = {"text": guidance.texts.embed(["a horse"])} | {
+        n: guidance.texts.embed(["blurry"]) for n in ("image", "plain")
+    }
     condition = guidance.seen_base(views.base, "refined")
     with torch.no_grad():
-        passes = guidance.predict_noise(z_t, t, texts, condition)
+        passes = guidance.predict_noise(z_t, t, texts, Beside(condition))
     noise = passes["plain"] + 1.5 * (passes["image"] - passes["plain"]) + 7.5 * (passes["text"] - passes["image"])
     expected = pipeline.scheduler.step(noise, t[0], z_t).prev_sample
     torch.testing.assert_close(result, expected, rtol=1e-3, atol=1e-3)
@@ -220,10 +214,10 @@ def test_a_network_that_says_the_difference_is_added_to_what_it_saw(folders: dic
     guidance = load(folder)
     generator = torch.Generator().manual_seed(2)
     z_t, condition = (torch.randn(2, 4, 16, 16, generator=generator) for _ in range(2))
-    t, texts = torch.tensor([300, 800]), {name: guidance._embed(["a horse"] * 2) for name in ("text", "plain")}
+    t, texts = torch.tensor([300, 800]), {name: guidance.texts.embed(["a horse"] * 2) for name in ("text", "plain")}
     alpha_bar = guidance.alpha_bars[t].view(-1, 1, 1, 1)
     with torch.no_grad():
-        noise = guidance.predict_noise(z_t, t, texts, condition)
+        noise = guidance.predict_noise(z_t, t, texts, Beside(condition))
         for name, seen in (("text", condition), ("plain", torch.zeros_like(condition))):
             said = guidance.components.unet(torch.cat([z_t, seen], 1), t, texts[name]).sample
             clean = (z_t - (1 - alpha_bar).sqrt() * noise[name]) / alpha_bar.sqrt()
@@ -299,14 +293,16 @@ def test_gradient_of_a_known_denoiser(folders: dict[str, Path], variant: str, we
 def test_gradient_from_the_passes_by_hand(folders: dict[str, Path], kind: str, variant: str) -> None:
     guidance = load(folders[kind], variant=variant, guidance_scale=7.5, image_guidance_scale=1.5, view_prompts=False)
     views = views_for(guidance, "coarse", 2)
-    timesteps, noise = guidance._draw(2, 0, 10, "coarse", 3)
+    timesteps, noise = guidance.draws.of_step(2, 0, 10, "coarse", 3)
     abar = guidance.alpha_bars[timesteps].view(-1, 1, 1, 1)
     with torch.no_grad():
         z = guidance.encode(views.pictures, "coarse")
         condition = guidance.encode(views.base, "coarse") / 0.18215 if kind == "ip2p" else None
         texts = {"text": "a horse with wings", "image": "blurry", "plain": "blurry"}
-        embeddings = {name: guidance._embed([text] * 2) for name, text in texts.items()}
-        e = guidance.predict_noise(abar.sqrt() * z + (1 - abar).sqrt() * noise, timesteps, embeddings, condition)
+        embeddings = {name: guidance.texts.embed([text] * 2) for name, text in texts.items()}
+        e = guidance.predict_noise(
+            abar.sqrt() * z + (1 - abar).sqrt() * noise, timesteps, embeddings, Beside(condition)
+        )
     if variant == "csd":
         difference = e["text"] - e["image"]
     elif kind == "ip2p":
@@ -357,12 +353,12 @@ def test_only_passes_that_count_are_run(
 @pytest.mark.parametrize("annealing", ["linear", "sqrt"])
 def test_scheduled_timesteps_are_the_same_for_all_views(folders: dict[str, Path], annealing: str) -> None:
     guidance = load(folders["sd15"], timestep_range_coarse=(0.2, 0.9), timestep_annealing=annealing)
-    drawn = [guidance._draw(2, step, 5, "coarse", 0) for step in range(5)]
+    drawn = [guidance.draws.of_step(2, step, 5, "coarse", 0) for step in range(5)]
     due = [899, 724, 549, 375, 200] if annealing == "linear" else [899, 549, 405, 293, 200]
     assert [timesteps.tolist() for timesteps, _ in drawn] == [[t, t] for t in due]
     views = views_for(guidance, "coarse", 2)
     assert guidance.guide(views, 3, 5, "coarse", seed=0).logs["guidance_timestep"] == due[3]
-    assert not guidance._draw(2, 0, 5, "coarse", 4)[1].equal(drawn[0][1])
+    assert not guidance.draws.of_step(2, 0, 5, "coarse", 4)[1].equal(drawn[0][1])
 
 
 @pytest.mark.parametrize("variant", ["csd", SHORT_ISM, OF_TWO_STEPS], ids=["csd", "ism", "reconstruction"])

@@ -44,7 +44,7 @@ class Knows:
     def __init__(self, target: torch.Tensor) -> None:
         self.target = target
 
-    def predict_noise(self, z_t, timesteps, texts, condition, control=None):  # noqa: ANN001, ANN201
+    def predict_noise(self, z_t, timesteps, texts, beside):  # noqa: ANN001, ANN201
         level = self.alpha_bars[timesteps].view(-1, 1, 1, 1)
         return {name: (z_t - level.sqrt() * self.target) / (1 - level).sqrt() for name in texts}
 
@@ -68,7 +68,7 @@ def test_one_step_is_the_networks_first_estimate_with_both_scales() -> None:
     values = {"text": 0.3, "image": 0.2, "plain": 0.1}
 
     class Constant(Knows):
-        def predict_noise(self, z_t, timesteps, texts, condition, control=None):  # noqa: ANN001, ANN201
+        def predict_noise(self, z_t, timesteps, texts, beside):  # noqa: ANN001, ANN201
             return {name: torch.full_like(z_t, values[name]) for name in texts}
 
     texts = {name: torch.zeros(1, 1, 1) for name in values}

@@ -96,10 +96,10 @@ def test_a_step_with_a_picture_equals_the_pipelines_own(root: Path, guidance: Di
         latents=z_t,
         output_type="latent",
     ).images
-    texts = {"text": guidance._embed(["a horse with wings"]), "plain": guidance._embed(["blurry"])}
+    texts = {"text": guidance.texts.embed(["a horse with wings"]), "plain": guidance.texts.embed(["blurry"])}
     guidance.looks_at_picture = True
     with torch.no_grad():
-        seen = guidance.predict_noise(z_t, t, texts, None)
+        seen = guidance.predict_noise(z_t, t, texts)
     noise = seen["plain"] + 7.5 * (seen["text"] - seen["plain"])
     torch.testing.assert_close(result, pipeline.scheduler.step(noise, t[0], z_t).prev_sample, rtol=1e-4, atol=1e-4)
 

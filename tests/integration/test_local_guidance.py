@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import diffusers
 import pytest
+import tiny_guidance
 import torch
 from tiny_pipelines import save_pipeline
 from torch import Tensor
 
-from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import loading
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews
 
@@ -30,11 +30,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @cache
-def components_of(folder: Path) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder)))
-
-
-@cache
 def pipeline_of(folder: Path) -> diffusers.DiffusionPipeline:
     """As diffusers itself loads it."""
     pipeline = diffusers.DiffusionPipeline.from_pretrained(folder, safety_checker=None)
@@ -43,11 +38,7 @@ def pipeline_of(folder: Path) -> diffusers.DiffusionPipeline:
 
 
 def load(folder: Path, **settings: object) -> DiffusionGuidance:
-    guidance = DiffusionGuidance(
-        components_of(folder), GuidanceConfig(model=str(folder), view_prompts=False, **settings)
-    )
-    guidance.set_prompt("a horse with wings", "blurry")
-    return guidance
+    return tiny_guidance.load(folder, view_prompts=False, **settings)
 
 
 def views_for(guidance: DiffusionGuidance, phase: str = "coarse", count: int = 2) -> GuidanceViews:
@@ -71,7 +62,7 @@ def gradient_of(guidance: DiffusionGuidance, views: GuidanceViews, phase: str = 
 
 def noisy_latents(guidance: DiffusionGuidance, views: GuidanceViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """z_t, timesteps, noise and alpha_bar of the coarse phase's first step, from the scheduler's own table."""
-    timesteps, noise = guidance._draw(len(views.pictures), 0, 10, "coarse", 3)
+    timesteps, noise = guidance.draws.of_step(len(views.pictures), 0, 10, "coarse", 3)
     scheduler = diffusers.DDIMScheduler.from_pretrained(guidance.components.folder / "scheduler")
     z = views.pictures.detach()[:, :4]
     alpha_bar = scheduler.alphas_cumprod[timesteps].view(-1, 1, 1, 1)
@@ -156,10 +147,10 @@ def test_an_inpainting_step_equals_the_pipelines_own(folders: dict[str, Path], m
         width=128,
         output_type="latent",
     ).images
-    texts = {"text": guidance._embed(["a horse with wings"]), "plain": guidance._embed(["blurry"])}
+    texts = {"text": guidance.texts.embed(["a horse with wings"]), "plain": guidance.texts.embed(["blurry"])}
     condition = guidance.conditions.seen_around(views.base, guidance.conditions.holes(views), "refined")
     with torch.no_grad():
-        seen = guidance.predict_noise(z_t, t, texts, condition)
+        seen = guidance.predict_noise(z_t, t, texts, Beside(condition))
     noise = seen["plain"] + 7.5 * (seen["text"] - seen["plain"])
     torch.testing.assert_close(result, pipeline.scheduler.step(noise, t[0], z_t).prev_sample, rtol=1e-4, atol=1e-4)
 

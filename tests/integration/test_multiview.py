@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +16,7 @@ from accelerate import init_empty_weights
 from diffusers.models.attention_processor import Attention
 from safetensors.torch import save_file
 from test_whole_run import SETTINGS
+from tiny_guidance import components_of, load
 from tiny_multiview import CONFIG, MultiViewUNet, edit, made_unet, save_multiview
 from tiny_pipelines import save_pipeline
 from tiny_runs import write_place
@@ -29,7 +29,8 @@ from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import diffusion, loading, step_draws
+from fd_mitsuba.guidance import loading, picture_gradient, step_draws
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews
 from fd_mitsuba.guidance.multiview import JointAttention, camera_conditions
@@ -52,18 +53,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def reference() -> MultiViewUNet:
     return made_unet()
-
-
-@cache
-def components_of(folder: Path) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder)))
-
-
-def load(folder: Path, appearance: AppearanceConfig | None = None, **settings: object) -> DiffusionGuidance:
-    config = GuidanceConfig(model=str(folder), **settings)
-    guidance = DiffusionGuidance(components_of(folder), config, appearance=appearance)
-    guidance.set_prompt("a horse with wings", "blurry")
-    return guidance
 
 
 def inputs(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -119,7 +108,7 @@ def test_the_loaded_network_is_the_reference(root: Path, reference: MultiViewUNe
     guidance = load(root / name)
     z_t, times, texts, cameras = inputs(8)
     with torch.no_grad():
-        got = guidance.predict_noise(z_t, times, {"text": texts}, None, cameras=cameras)["text"]
+        got = guidance.predict_noise(z_t, times, {"text": texts}, Beside(cameras=cameras))["text"]
         assert_close(got, reference(z_t, times, texts, cameras, 4), 1e-5)
         alone = reference(z_t, times, texts, cameras, 1)
     assert (got - alone).abs().max() > 1e-3 * alone.abs().max(), "the views see each other"
@@ -131,11 +120,12 @@ def test_groups_never_mix(root: Path) -> None:
     with torch.no_grad():
         seen = {
             most: load(root / "mvdream", views_per_call=most).predict_noise(
-                z_t, times, {"text": texts, "plain": texts.flip(0)}, None, cameras=cameras
+                z_t, times, {"text": texts, "plain": texts.flip(0)}, Beside(cameras=cameras)
             )
             for most in (4, 7, 8, 64)
         }
-        first = load(root / "mvdream").predict_noise(z_t[:4], times[:4], {"text": texts[:4]}, None, cameras=cameras[:4])
+        few = z_t[:4], times[:4], {"text": texts[:4]}, Beside(cameras=cameras[:4])
+        first = load(root / "mvdream").predict_noise(*few)
     for most in (7, 8, 64):
         for name, noise in seen[4].items():
             assert_close(seen[most][name], noise, 1e-5)
@@ -156,7 +146,7 @@ def test_one_view_a_group_and_no_cameras_is_the_plain_unet(root: Path, tmp_path:
     unet.save_pretrained(folder / "unet")
     z_t, times, texts, cameras = inputs(4)
     with torch.no_grad():
-        got = load(folder).predict_noise(z_t, times, {"text": texts}, None, cameras=cameras)["text"]
+        got = load(folder).predict_noise(z_t, times, {"text": texts}, Beside(cameras=cameras))["text"]
         assert_close(got, plain(z_t, times, texts).sample, 1e-5)
 
 
@@ -178,7 +168,7 @@ def test_the_published_config_has_the_weights_of_its_base_and_an_mlp() -> None:
 @pytest.mark.parametrize("settings", [{}, {"views_per_call": 16}], ids=["by group", "at once"])
 def test_the_gradient_by_hand(root: Path, reference: MultiViewUNet, settings: dict[str, int]) -> None:
     guidance, views = load(root / "mvdream", guidance_scale=7.5, **settings), views_of()
-    times, noise = guidance._draw(8, 2, 10, "coarse", 3)
+    times, noise = guidance.draws.of_step(8, 2, 10, "coarse", 3)
     assert times[0] == times[3] != times[4] == times[7], "one timestep a group"
     pipeline = diffusers.StableDiffusionPipeline.from_pretrained(root / "converted", safety_checker=None)
     text, plain = pipeline.encode_prompt(["a horse with wings, 3d asset"] * 8, "cpu", 1, True, ["blurry"] * 8)
@@ -199,13 +189,13 @@ def test_the_gradient_of_the_appearance_stage_by_hand(root: Path, reference: Mul
     colours = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(2)).requires_grad_()
     whole = torch.ones(4, 1, 64, 64)
     views = AppearanceViews(colours, None, whole, whole, whole, AZIMUTHS, ELEVATIONS)
-    times, noise = guidance._draw(4, 0, 10, "appearance", 3)
+    times, noise = guidance.draws.of_step(4, 0, 10, "appearance", 3)
     z = guidance.components.vae.encode(2 * colours - 1).latent_dist.mean * guidance.components.vae.config.scaling_factor
     alpha_bar = guidance.components.scheduler.alphas_cumprod[times].view(-1, 1, 1, 1)
     z_t = alpha_bar.sqrt() * z.detach() + (1 - alpha_bar).sqrt() * noise
     cameras = camera_conditions(AZIMUTHS, ELEVATIONS)
     with torch.no_grad():
-        texts = [guidance._embed([text] * 4) for text in ("a horse with wings, 3d asset", "blurry")]
+        texts = [guidance.texts.embed([text] * 4) for text in ("a horse with wings, 3d asset", "blurry")]
         e = [reference(z_t, times, states, cameras, 4) for states in texts]
     w = 1 / (1 - alpha_bar)
     expected = torch.autograd.grad(z, colours, w * (e[1] + 7.5 * (e[0] - e[1]) - noise) / 4)[0]
@@ -238,7 +228,7 @@ def test_a_critic_is_told_the_cameras_too(root: Path) -> None:
     assert_close(first, 6.5 * expected)
     moved = [value for name, value in guidance.learned_state().items() if name.endswith(".up")]
     assert all(value.abs().max() > 0 for value in moved), "every layer has learned"
-    times, _ = guidance._lesson(views, 1, "coarse", 3)
+    times, _ = guidance.draws.lesson(views, 1, "coarse", 3)
     assert times[0] == times[3] != times[4] == times[7]
 
 
@@ -275,7 +265,7 @@ def test_the_shares_of_two_processes_add_up_to_the_whole(root: Path, monkeypatch
     guidance, views, shares = load(root / "mvdream"), views_of(), []
     whole = gradient_of(guidance, views)
     for rank in range(2):
-        for module in (diffusion, step_draws):
+        for module in (picture_gradient, step_draws):
             monkeypatch.setattr(module, "processes", lambda rank=rank: Processes(rank, 2))
         own = Processes(rank, 2).share(8)
         pictures = views.pictures[own].detach().requires_grad_()
@@ -290,7 +280,7 @@ def test_groups_must_be_whole(root: Path) -> None:
     with pytest.raises(ValueError, match="6 views do not fill groups of 4"):
         gradient_of(guidance, views_of(6))
     with pytest.raises(UserError, match="multi-view model, which must be told its cameras"):
-        guidance.predict_noise(*inputs(4)[:2], {"text": inputs(4)[2]}, None)
+        guidance.predict_noise(*inputs(4)[:2], {"text": inputs(4)[2]})
 
 
 # What cannot be.

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from tiny_guidance import load
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
-from fd_mitsuba.guidance import loading
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceViews
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
@@ -23,18 +22,6 @@ from fd_mitsuba.guidance.step_draws import step_generator
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("details")
     return {kind: save_pipeline(kind, root / kind) for kind in ("sd15", "ip2p")}
-
-
-@cache
-def components_of(folder: Path) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder)))
-
-
-def load(folder: Path, appearance: AppearanceConfig | None = None, **settings: object) -> DiffusionGuidance:
-    config = GuidanceConfig(model=str(folder), **settings)
-    guidance = DiffusionGuidance(components_of(folder), config, appearance=appearance)
-    guidance.set_prompt("a horse with wings", "blurry")
-    return guidance
 
 
 def views_for(guidance: DiffusionGuidance, phase: str, count: int = 2) -> GuidanceViews:
@@ -111,14 +98,14 @@ def test_a_soft_mask_is_the_parts_share_of_each_cell(folders: dict[str, Path]) -
     part = torch.zeros(1, 1, 128, 128)
     part[..., 20:60, 10:75] = 1
     views = AppearanceViews(colours, None, part, part, part, [0.0], [0.0])
-    t, noise = guidance._draw(1, 0, 10, "appearance", 3)
+    t, noise = guidance.draws.of_step(1, 0, 10, "appearance", 3)
     a = guidance.alpha_bars[t]
     share = part.view(1, 1, 16, 8, 16, 8).mean(dim=(3, 5))
     assert 0 < float(share[share > 0].min()) < 1
     z = guidance.encode(colours, "appearance")
     with torch.no_grad():
         z_t = a.sqrt() * z + (1 - a).sqrt() * noise * share
-        seen = guidance.components.unet(z_t, t, guidance._embed(["a horse with wings"])).sample
+        seen = guidance.components.unet(z_t, t, guidance.texts.embed(["a horse with wings"])).sample
     expected = torch.autograd.grad(z, colours, share * (seen - share * noise))[0]
     got = torch.autograd.grad(guidance.guide_appearance(views, 0, 10, 3).loss, colours)[0]
     assert (got - expected).abs().max() < 1e-4 * expected.abs().max()

@@ -17,7 +17,7 @@ from tiny_runs import FIELD, TEXTURE
 
 from fd_mitsuba.backend.processes import Processes
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.guidance import diffusion, step_draws
+from fd_mitsuba.guidance import picture_gradient, step_draws
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews
 from fd_mitsuba.training.record import read_metrics
@@ -67,7 +67,7 @@ def test_the_shares_of_two_add_up_to_the_whole(
 
     whole, shares = gradient(views), []
     for rank in range(2):
-        for module in (diffusion, step_draws):
+        for module in (picture_gradient, step_draws):
             monkeypatch.setattr(module, "processes", lambda rank=rank: Processes(rank, 2))
         own = Processes(rank, 2).share(4)
         part = replace(

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import diffusers
 import pytest
+import tiny_guidance
 import torch
 from tiny_pipelines import build_pipeline
 from torch import Tensor
 from torch.func import functional_call
 
 from fd_mitsuba.backend.processes import Processes
-from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.guidance import critic as module
-from fd_mitsuba.guidance import diffusion, loading, step_draws
+from fd_mitsuba.guidance import picture_gradient, step_draws
 from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews
@@ -46,17 +45,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@cache
-def components_of(folder: Path) -> loading.Components:
-    return loading.load_components(GuidanceConfig(model=str(folder)))
-
-
 def load(folder: Path, **settings: object) -> DiffusionGuidance:
     variant = {"kind": "vsd", "rank": 2, "learning_rate": RATE}
     known = {"variant": variant, "view_prompts": False, "guidance_scale": 7.5, "views_per_call": 8} | settings
-    guidance = DiffusionGuidance(components_of(folder), GuidanceConfig(model=str(folder), **known))
-    guidance.set_prompt("a horse with wings", "blurry")
-    return guidance
+    return tiny_guidance.load(folder, **known)
 
 
 def views_of(count: int = 2, share: slice | None = None) -> GuidanceViews:
@@ -112,7 +104,8 @@ def test_steps_by_hand(folder: Path, views_per_call: int, steps: int) -> None:
     assert all((value == 0).all() == name.endswith("up") for name, value in start.items())
     reference, z = Reference(folder, start), views_of().pictures.detach()[:, :4]
     for step in range(steps):
-        drawn, lesson = guidance._draw(2, step, 10, "coarse", 3), guidance._lesson(views_of(), step, "coarse", 3)
+        drawn = guidance.draws.of_step(2, step, 10, "coarse", 3)
+        lesson = guidance.draws.lesson(views_of(), step, "coarse", 3)
         expected = reference.gradient(z, *drawn)
         views = views_of()
         result = guidance.guide(views, step, 10, "coarse", 3)
@@ -171,7 +164,7 @@ def test_two_processes_learn_together(folder: Path, monkeypatch: pytest.MonkeyPa
             given.setdefault(self.rank if self.count > 1 else 9, []).extend(tensor.clone() for tensor in tensors)
 
     for rank, count in ((0, 1), (0, 2), (1, 2)):
-        for place in (diffusion, step_draws, module):
+        for place in (picture_gradient, step_draws, module):
             monkeypatch.setattr(place, "processes", lambda rank=rank, count=count: Recording(rank, count))
         share = Processes(rank, count).share(4)
         gradient_of(load(folder), 0, views_of(4, share if count > 1 else None))

@@ -12,10 +12,11 @@ from normal_data import FREE, SIGMA, TEXT, along_the_path, chunk, denoiser, how,
 from torch import Tensor
 
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Area, Chunk
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import require_device
 from fd_mitsuba.guidance.prompts import TextEmbeddings
-from fd_mitsuba.guidance.variants import Area, Chunk, passes_of
+from fd_mitsuba.guidance.query import passes_of
 
 BUILT_IN = ("sds", "csd", "ism", "reconstruction")
 

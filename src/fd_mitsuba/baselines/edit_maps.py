@@ -22,6 +22,7 @@ from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import Views
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.runs.own_meshes import base_mesh
 from fd_mitsuba.scene.views import CameraBatch
@@ -101,12 +102,12 @@ class LookedAt:
     """Single views of an object as the network is given them.
 
     Attributes:
-        z: (N, 4, L, L) latents of the views; condition: what it sees of the base beside them, or None.
+        z: (N, 4, L, L) latents of the views; beside: what it sees of the base beside them.
         level: the timestep.
     """
 
     z: Tensor
-    condition: Tensor | None
+    beside: Beside
     level: int
 
     def noised(self, guidance: DiffusionGuidance, seed: int) -> Tensor:
@@ -116,7 +117,7 @@ class LookedAt:
 
     def some(self, rows: slice) -> LookedAt:
         """Some of the views."""
-        return LookedAt(self.z[rows], None if self.condition is None else self.condition[rows], self.level)
+        return LookedAt(self.z[rows], self.beside.rows(rows), self.level)
 
 
 @torch.no_grad()
@@ -138,7 +139,7 @@ def looked_at(task: EditTask, settings: MapSettings, shown: Shown, cameras: Came
         if guidance.has_image_pass:
             seen.append(guidance.seen_base(base[few], phase))
     level = round(settings.attention_time * (len(guidance.alpha_bars) - 1))
-    return LookedAt(torch.cat(rows), torch.cat(seen) if seen else None, level)
+    return LookedAt(torch.cat(rows), Beside(torch.cat(seen) if seen else None), level)
 
 
 @torch.no_grad()
@@ -165,7 +166,7 @@ def attention_maps(
         texts, times = guidance.embeddings([text], ("text",)), torch.tensor([seen.level], device=guidance.device)
         # One view at a time: several threads would mix up whose attention is whose.
         with recorded_attention(guidance.components.unet) as maps:
-            guidance.predict_noise(z_t[few], times, texts, seen.some(few).condition)
+            guidance.predict_noise(z_t[few], times, texts, seen.some(few).beside)
         rows.append(word_maps(maps, groups, ATTENTION_SIDE))
     return torch.stack(rows)
 
@@ -188,7 +189,7 @@ def difference_maps(task: EditTask, settings: MapSettings, seen: LookedAt, camer
             z_t = seen.some(few).noised(guidance, seed_for(task.config.seed, Purpose.GUIDANCE, draw))
             times = torch.tensor([seen.level], device=guidance.device)
             both = [
-                guidance.predict_noise(z_t, times, {"text": text[few]}, seen.some(few).condition)["text"]
+                guidance.predict_noise(z_t, times, {"text": text[few]}, seen.some(few).beside)["text"]
                 for text in texts.values()
             ]
             found = found + (both[0] - both[1]).abs().mean(dim=1, keepdim=True).cpu()

@@ -10,12 +10,13 @@ from torch import Tensor
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import NOTHING, Beside, Chunk
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
 from fd_mitsuba.guidance.model_conventions import FILE_NAME
 from fd_mitsuba.guidance.multiview import is_multiview
+from fd_mitsuba.guidance.query import Distillation, Query, passes_of
 from fd_mitsuba.guidance.side_by_side import cores_for_samples, of_samples
-from fd_mitsuba.guidance.variants import Chunk, Distillation, Query, passes_of
 
 
 class Denoiser:
@@ -53,27 +54,19 @@ class Denoiser:
             )
 
     def predict_noise(
-        self,
-        z_t: Tensor,
-        timesteps: Tensor,
-        texts: dict[str, Tensor],
-        condition: Tensor | None,
-        control: Tensor | None = None,
-        cameras: Tensor | None = None,
+        self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], beside: Beside = NOTHING
     ) -> dict[str, Tensor]:
         """Noise (N, 4, L, L), float32, of each pass that `texts` names, with at most `views_per_call` pictures at once.
 
         Args:
             z_t: noisy latents (N, 4, L, L); timesteps: (N,) int64.
             texts: embeddings (N, length, width) for any of the passes `text`, `image`, `plain` (see `sds`), `negative`.
-            condition: the base's latents (N, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
-                For 9 channels (N, 5, L, L), the mask first; all passes see it.
-            control: pictures (N, 3, H, H) in [0, 1] for the ControlNet, in all passes; None: it is not asked.
-            cameras: (N, 16), of `camera_conditions`, for a network that takes them.
+            beside: what else it sees of these pictures.
 
         Raises:
             UserError: no cameras for a network that takes them.
         """
+        condition, control, cameras = beside.condition, beside.control, beside.cameras
         if self.takes_cameras and cameras is None:
             raise UserError(
                 f"{self.components.folder}: a multi-view model, which must be told its cameras; it serves a run's "

@@ -1,27 +1,25 @@
 """Guidance by a Diffusers pipeline in Stable Diffusion's layout: the adapter between pictures, network and `sds`.
 
 One call of `guide`: views -> (mosaics) -> latents z -> z_t -> the UNet's noise -> gradient with respect to z -> back
-through the encoder to the pictures. Pictures are handled in chunks, each of which ends with its gradient with respect
-to the pictures; so the memory follows `views_per_call` in every phase, and the result does not depend on it.
+through the encoder to the pictures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from fd_mitsuba.backend.processes import processes
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.conditions import Conditions
 from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.denoiser import Denoiser
@@ -31,10 +29,13 @@ from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.multiview import camera_conditions
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
+from fd_mitsuba.guidance.picture_gradient import StepPictures, picture_gradient
 from fd_mitsuba.guidance.picture_latents import PictureLatents
-from fd_mitsuba.guidance.prompts import TextEmbeddings, unknown_words, view_prompt
-from fd_mitsuba.guidance.step_draws import drawn_timesteps, own_share, step_generator
-from fd_mitsuba.guidance.variants import VARIANTS, Area, Chunk, Distillation, VariationalScore
+from fd_mitsuba.guidance.prompts import TextEmbeddings
+from fd_mitsuba.guidance.query import Distillation, timestep_range
+from fd_mitsuba.guidance.scene_texts import SceneTexts
+from fd_mitsuba.guidance.step_draws import StepDraws, own_share, step_generator
+from fd_mitsuba.guidance.variants import VARIANTS, VariationalScore
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -64,23 +65,33 @@ class DiffusionGuidance(Denoiser):
             raise UserError(
                 f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
             )
-        self.critic: Critic | None = None
-        if isinstance(self.variant, VariationalScore):
-            own = self.variant.settings
-            if config.dtype == "float16":
-                raise UserError(
-                    "guidance.variant = vsd: what its critic learns is too small for float16; set guidance.dtype to "
-                    "bfloat16 or float32"
-                )
-            self.critic = Critic(components.unet, own.rank, own.learning_rate)
+        self.critic = self._make_critic()
         self.view_grid = components.conventions.view_grid
         self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
         self.conditions = Conditions(self.latents, config, self.view_grid, self.device, components.folder)
-        self._embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
-        self._prompt: str | None = None
-        self._negative_prompt = ""
-        self._part_prompts: dict[str, tuple[str, str]] = {}
+        embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
+        self.texts = SceneTexts(embed, self.conventions, config, self.latent_size, self.device)
+        self.draws = StepDraws(
+            config,
+            partial(timestep_range, config, self.appearance),
+            len(self.alpha_bars),
+            self.latent_size,
+            self.view_grid,
+            self.views_together,
+            self.device,
+        )
+
+    def _make_critic(self) -> Critic | None:
+        if not isinstance(self.variant, VariationalScore):
+            return None
+        if self.config.dtype == "float16":
+            raise UserError(
+                "guidance.variant = vsd: what its critic learns is too small for float16; set guidance.dtype to "
+                "bfloat16 or float32"
+            )
+        own = self.variant.settings
+        return Critic(self.components.unet, own.rank, own.learning_rate)
 
     @classmethod
     def load(
@@ -114,10 +125,7 @@ class DiffusionGuidance(Denoiser):
 
     def set_prompt(self, prompt: str, negative_prompt: str = "") -> list[str]:
         """Take the texts; returns the words that the model cannot know (none where it has CLIP's own vocabulary)."""
-        self._prompt, self._negative_prompt = prompt, negative_prompt
-        if not self.conventions.whole_words:
-            return []
-        return unknown_words(self.components.tokenizer, f"{prompt} {negative_prompt}")
+        return self.texts.set_prompt(prompt, negative_prompt)
 
     def set_part_prompts(self, prompts: Mapping[str, tuple[str, str]]) -> None:
         """Take part -> (prompt, negative prompt) of the parts that have their own; "" is the scene's negative prompt.
@@ -125,12 +133,12 @@ class DiffusionGuidance(Denoiser):
         Where a part's focal regions are seen (`GuidanceViews.regions`), the network's noise is what it sees with these
         texts, elsewhere what it sees with those of `set_prompt`: one pass of the network more for each such part.
         """
-        self._part_prompts = dict(prompts)
+        self.texts.set_part_prompts(prompts)
 
     @property
     def region_size(self) -> int | None:
         """Side in pixels of `GuidanceViews.regions`; None where they are not looked at."""
-        return self.latent_size // self.view_grid if self._part_prompts or self.inpaints else None
+        return self.latent_size // self.view_grid if self.texts.of_parts or self.inpaints else None
 
     @property
     def control_sees(self) -> str | None:
@@ -143,13 +151,15 @@ class DiffusionGuidance(Denoiser):
         Args:
             text: a part's, in place of the scene's prompt.
         """
-        text = self._prompt if text is None else text
-        if text is None:
-            raise ValueError("set_prompt must be called before guide")
-        return [
-            view_prompt(text, float(azimuth), views.closeup, self.conventions, self.config.view_prompts)
-            for azimuth in list(views.azimuth_deg)[:: self.view_grid**2]
-        ]
+        return self.texts.prompts(views, text)
+
+    def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
+        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt.
+
+        Args:
+            negative: in place of that of `set_prompt`.
+        """
+        return self.texts.embeddings(prompts, passes, negative)
 
     @network_threads()
     def guide(self, views: GuidanceViews, step: int, steps_total: int, phase: Phase, seed: int) -> GuidanceResult:
@@ -173,8 +183,8 @@ class DiffusionGuidance(Denoiser):
             turns = random_turns(total, self.config.normal_augmentation, generator)[share]
             pictures, shown = turned(pictures, turns), None if shown is None else turned(shown, turns)
         images, base = self._images(pictures, shown, phase)
-        drawn = self._draw_for(views, step, steps_total, phase, seed)
-        return self._distil(images, base, views, phase, *drawn, lesson=self._lesson(views, step, phase, seed))
+        drawn = self.draws.of_views(views, step, steps_total, phase, seed)
+        return self._distil(images, base, views, phase, drawn, self._lesson(views, step, phase, seed))
 
     @network_threads()
     def guide_appearance(self, views: AppearanceViews, step: int, steps_total: int, seed: int) -> GuidanceResult:
@@ -194,9 +204,9 @@ class DiffusionGuidance(Denoiser):
             part = tile_views(views.part_mask, self.view_grid).to(self.device).detach()
             share = adaptive_avg_pool2d(part, self.latent_size)
             mask = share if self.appearance.soft_mask else (share >= MASK_THRESHOLD).to(images.dtype)
-        drawn = self._draw_for(views, step, steps_total, "appearance", seed)
+        drawn = self.draws.of_views(views, step, steps_total, "appearance", seed)
         lesson = self._lesson(views, step, "appearance", seed)
-        return self._distil(images, base, views, "appearance", *drawn, mask, lesson)
+        return self._distil(images, base, views, "appearance", drawn, lesson, mask)
 
     def encode(self, images: Tensor, phase: Phase) -> Tensor:
         """Scaled latents z (N, 4, L, L) of pictures or mosaics; see `PictureLatents`. Gradients flow."""
@@ -212,121 +222,47 @@ class DiffusionGuidance(Denoiser):
         base: Tensor | None,
         views: GuidanceViews | AppearanceViews,
         phase: Phase,
-        timesteps: Tensor,
-        noise: Tensor,
+        drawn: tuple[Tensor, Tensor],
+        lesson: tuple[Tensor, Tensor] | None,
         mask: Tensor | None = None,
-        lesson: tuple[Tensor, Tensor] | None = None,
     ) -> GuidanceResult:
         self.looks_at_picture = phase == "appearance"
-        how, count, (_, total) = self._how(phase), len(images), own_share(views)
-        total //= self.view_grid**2
-        texts = self.embeddings(self.prompts(views), self.passes(how))
-        areas = self._areas(views, self.passes(how))
-        holes = self.conditions.holes(views) if self.inpaints else None
-        control = self.conditions.control(views, self.control_sees)
-        together = self.views_together
+        how, count, together = self._how(phase), len(images), self.views_together
         if count % together:
             raise ValueError(f"{count} views do not fill groups of {together}; give a multiple of {together}")
-        cameras = None
-        if self.takes_cameras:
-            cameras = camera_conditions(views.azimuth_deg, views.elevation_deg).to(self.device)
-        rows_per_chunk = max(1, self.config.views_per_call // len(texts) // together) * together
-        track = images.requires_grad and torch.is_grad_enabled()
-
-        picture_gradients, latent_gradients, previews = [], [], []
-        critic_loss = 0.0
-        for start in range(0, count, rows_per_chunk):
-            rows = slice(start, start + rows_per_chunk)
-            leaf = images[rows].detach().requires_grad_(track)
-            with torch.set_grad_enabled(track):
-                z = self.encode(leaf, phase)
-            chunk = Chunk(
-                z=z.detach(),
-                noise=noise[rows],
-                timesteps=timesteps[rows],
-                texts={name: embedding[rows] for name, embedding in texts.items()},
-                condition=self.conditions.beside_latents(
-                    None if base is None else base[rows], None if holes is None else holes[rows], phase
-                ),
-                mask=None if mask is None else mask[rows],
-                areas=tuple(area.rows(rows) for area in areas),
-                control=None if control is None else control[rows],
-                cameras=None if cameras is None else cameras[rows],
-            )
-            gradient, preview = self.latent_gradient(chunk, how)
-            if self.critic is not None and lesson is not None and track:
-                asked = replace(chunk, timesteps=lesson[0][rows], noise=lesson[1][rows])
-                critic_loss += self.teach(asked, how, total)
-            self._check_finite(gradient, chunk.timesteps, "latents")
-            if track:
-                picture_gradients.append(torch.autograd.grad(z, leaf, gradient)[0])
-                self._check_finite(picture_gradients[-1], chunk.timesteps, "pictures")
-            latent_gradients.append(gradient)
-            previews.append(preview)
-
-        if self.critic is not None and lesson is not None and track:
+        passes, total = self.passes(how), own_share(views)[1] // self.view_grid**2
+        cameras = camera_conditions(views.azimuth_deg, views.elevation_deg) if self.takes_cameras else None
+        control = self.conditions.control(views, self.control_sees)
+        step = StepPictures(
+            images,
+            base,
+            self.conditions.holes(views) if self.inpaints else None,
+            Beside(control=control, cameras=None if cameras is None else cameras.to(self.device)),
+            *drawn,
+            lesson,
+            self.embeddings(self.prompts(views), passes),
+            self.texts.areas(views, passes),
+            mask,
+            total,
+        )
+        rows = max(1, self.config.views_per_call // len(step.texts) // together) * together
+        found = picture_gradient(step, self, self.latents, self.conditions, how, phase, rows)
+        if self.critic is not None and lesson is not None and found.pictures is not None:
             self.critic.take_step()
-        gradient = torch.cat(latent_gradients)
-        # The way back to the pictures is linear, so that it may be scaled at its end, when all chunks are known.
-        scale = 1 / total if self.config.reduction == "mean" else 1.0
-        if self.config.normalise_gradient:
-            scale *= sds.normalising_scale(gradient, mask) if total == count else _scale_of_all(gradient, mask)
-        value = 0.5 * scale * float(gradient.square().sum())
-        loss = images.new_tensor(value)
-        if track:
-            loss = sds.carry_gradient(images, scale * torch.cat(picture_gradients), value)
-        loss = loss.cpu()  # beside the other losses, which know no other device
+        loss, value = found.loss(images, mask, total, self.config)
         logs = {
             "guidance_loss": value,
-            "guidance_gradient_mean": float(gradient.abs().mean()),
-            "guidance_gradient_max": float(gradient.abs().max()),
-            "guidance_timestep": float(timesteps.float().mean()),
+            "guidance_gradient_mean": float(found.latents.abs().mean()),
+            "guidance_gradient_max": float(found.latents.abs().max()),
+            "guidance_timestep": float(step.timesteps.float().mean()),
         }
         if self.critic is not None:
-            logs["guidance_critic_loss"] = critic_loss
-        return GuidanceResult(loss=loss, logs=logs, preview=torch.cat(previews))
+            logs["guidance_critic_loss"] = found.critic_loss
+        # Its loss is to be added to others, which know no other device than the CPU.
+        return GuidanceResult(loss=loss.cpu(), logs=logs, preview=found.previews)
 
     def _how(self, phase: Phase) -> Distillation:
-        if phase == "appearance":
-            settings, bounds = self.appearance, self.appearance.timestep_range
-        else:
-            settings = self.config
-            bounds = settings.timestep_range_refined if phase == "refined" else settings.timestep_range_coarse
-        return Distillation(
-            self.variant,
-            settings.weighting,
-            settings.guidance_scale,
-            settings.image_guidance_scale,
-            bounds,
-            self.config.perp_neg,
-            self.critic,
-        )
-
-    def embeddings(self, prompts: list[str], passes: Iterable[str], negative: str = "") -> dict[str, Tensor]:
-        """Text states (N, length, width) for each of the network's passes: the prompts, or the negative prompt.
-
-        Args:
-            negative: in place of that of `set_prompt`.
-        """
-        against = negative or self._negative_prompt
-        read = {"text": prompts, "negative": [against] * len(prompts)}
-        without = ["" if self.config.perp_neg else against] * len(prompts)
-        return {name: self._embed(read.get(name, without)) for name in passes}
-
-    def _areas(self, views: GuidanceViews | AppearanceViews, passes: Iterable[str]) -> tuple[Area, ...]:
-        """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out."""
-        found = []
-        for part, (prompt, negative) in self._part_prompts.items():
-            if part not in views.regions:
-                raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
-            own = {"text"} if negative in ("", self._negative_prompt) else set(passes)
-            if self.config.perp_neg:
-                own &= {"text", "negative"}
-            mask = tile_views(views.regions[part], self.view_grid).to(self.device)
-            names = [name for name in passes if name in own]
-            texts = self.embeddings(self.prompts(views, prompt), names, negative)
-            found.append(Area(adaptive_avg_pool2d(mask, self.latent_size), texts))
-        return tuple(found)
+        return Distillation.of_phase(phase, self.config, self.appearance, self.variant, self.critic)
 
     def _images(self, pictures: Tensor, base: Tensor | None, phase: Phase) -> tuple[Tensor, Tensor | None]:
         """Pictures and, if the model sees it, the base, as mosaics on the network's device."""
@@ -340,47 +276,15 @@ class DiffusionGuidance(Denoiser):
             return images, None
         return images, tile_views(base, self.view_grid).to(self.device).detach()
 
-    def _draw_for(
-        self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
-    ) -> tuple[Tensor, Tensor]:
-        """`_draw` for these of the step's views."""
-        share, total = own_share(views)
-        grid = self.view_grid**2
-        timesteps, noise = self._draw(total // grid, step, steps_total, phase, seed)
-        own = slice(share.start // grid, share.stop // grid)
-        return timesteps[own], noise[own]
-
-    def _draw(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
-        """Timesteps (count,) and noise (count, 4, L, L); drawn on the CPU, so that the device does not change them."""
-        generator = step_generator(seed, step, phase)
-        progress = min(step / max(steps_total - 1, 1), 1.0)
-        bounds, levels = self._how(phase).timestep_range, len(self.alpha_bars)
-        # Views that are seen at once have one timestep, as in the training of such models.
-        groups = count // self.views_together
-        timesteps = drawn_timesteps(self.config, bounds, levels, groups, progress, generator)
-        timesteps = timesteps.repeat_interleave(self.views_together)
-        noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
-        return timesteps.to(self.device), noise.to(self.device)
-
     def _lesson(
         self, views: GuidanceViews | AppearanceViews, step: int, phase: Phase, seed: int
     ) -> tuple[Tensor, Tensor] | None:
-        """Timesteps, from the whole range, and noise of these views for the critic; None without one.
-
-        It starts anew with a phase, whose latents are of another kind.
-        """
+        """What the critic, if any, is taught. It starts anew with a phase, whose latents are of another kind."""
         if self.critic is None:
             return None
         if step == 0:
             self.critic.reset()
-        generator = step_generator(seed, step, phase, 2)
-        share, total = own_share(views)
-        grid, together = self.view_grid**2, self.views_together
-        count = total // grid
-        timesteps = torch.randint(1, len(self.alpha_bars), (count // together,), generator=generator)
-        noise = torch.randn((count, 4, self.latent_size, self.latent_size), generator=generator)
-        own = slice(share.start // grid, share.stop // grid)
-        return timesteps.repeat_interleave(together)[own].to(self.device), noise[own].to(self.device)
+        return self.draws.lesson(views, step, phase, seed)
 
     def learned_state(self) -> dict[str, Tensor]:
         """What was learned from step to step, for a checkpoint; empty but for the variant `vsd`."""
@@ -390,20 +294,3 @@ class DiffusionGuidance(Denoiser):
         """Go on from a `learned_state`. Raises ValueError where it is of another model."""
         if self.critic is not None:
             self.critic.load_state(state)
-
-    def _check_finite(self, gradient: Tensor, timesteps: Tensor, where: str) -> None:
-        bad = ~gradient.isfinite().flatten(1).all(1)
-        if bad.any():
-            raise NonFiniteGuidance(
-                f"{self.components.folder}: the guidance gradient of the {where} is not finite at timestep "
-                f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
-                "lower guidance.guidance_scale"
-            )
-
-
-def _scale_of_all(gradient: Tensor, mask: Tensor | None) -> float:
-    """`sds.normalising_scale` over the views of all processes."""
-    size = gradient.abs()
-    covered = torch.ones_like(size) if mask is None else (mask.expand_as(size) > 0).to(size.dtype)
-    total, cells = (processes().sum(float(values.sum())) for values in (size * covered, covered))
-    return cells / max(total, torch.finfo(gradient.dtype).tiny) if cells else 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import get_args
 
 import numpy as np
@@ -28,24 +29,65 @@ def own_share(views: GuidanceViews | AppearanceViews) -> tuple[slice, int]:
     return views.share, own * processes().count
 
 
-def drawn_timesteps(
-    config: GuidanceConfig,
-    bounds: tuple[float, float],
-    levels: int,
-    count: int,
-    progress: float,
-    generator: torch.Generator,
-) -> Tensor:
-    """(count,) int64 on the CPU, random or, with `timestep_annealing`, the one that is due.
+class StepDraws:
+    """Timesteps (N,) int64 and noise (N, 4, L, L) of pictures; drawn on the CPU, so that no device changes them.
 
     Args:
-        config: says which.
-        bounds: least and greatest, as shares of `levels`.
+        config: random timesteps or, with `timestep_annealing`, the one that is due.
+        bounds: of a phase's timesteps, as shares of `levels`.
         levels: the model's training timesteps.
-        count: of pictures.
-        progress: of the phase, in [0, 1].
-        generator: of `step_generator`.
+        latent_size: cells a side of the latents.
+        view_grid: pictures are mosaics of view_grid x view_grid views.
+        together: consecutive pictures that are seen at once and have one timestep, as in the training of such models.
+        device: where they go.
     """
-    if config.timestep_annealing == "none":
-        return sds.draw_timesteps(bounds, levels, count, generator)
-    return sds.scheduled_timesteps(bounds, levels, count, config.timestep_annealing, progress)
+
+    def __init__(
+        self,
+        config: GuidanceConfig,
+        bounds: Callable[[Phase], tuple[float, float]],
+        levels: int,
+        latent_size: int,
+        view_grid: int,
+        together: int,
+        device: torch.device,
+    ) -> None:
+        self._config, self._bounds, self._levels = config, bounds, levels
+        self._shape = (4, latent_size, latent_size)
+        self._views, self._together, self._device = view_grid**2, together, device
+
+    def of_step(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
+        """Of all `count` pictures of a step."""
+        generator, bounds = step_generator(seed, step, phase), self._bounds(phase)
+        groups, annealing = count // self._together, self._config.timestep_annealing
+        if annealing == "none":
+            timesteps = sds.draw_timesteps(bounds, self._levels, groups, generator)
+        else:
+            progress = min(step / max(steps_total - 1, 1), 1.0)
+            timesteps = sds.scheduled_timesteps(bounds, self._levels, groups, annealing, progress)
+        return self._with_noise(timesteps, generator)
+
+    def of_views(
+        self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """`of_step` for these of the step's views."""
+        return self._own(views, *self.of_step(own_share(views)[1] // self._views, step, steps_total, phase, seed))
+
+    def lesson(
+        self, views: GuidanceViews | AppearanceViews, step: int, phase: Phase, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """What a critic is taught these views with: timesteps from the whole range."""
+        generator = step_generator(seed, step, phase, 2)
+        groups = own_share(views)[1] // self._views // self._together
+        timesteps = torch.randint(1, self._levels, (groups,), generator=generator)
+        return self._own(views, *self._with_noise(timesteps, generator))
+
+    def _with_noise(self, timesteps: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        timesteps = timesteps.repeat_interleave(self._together)
+        noise = torch.randn((len(timesteps), *self._shape), generator=generator)
+        return timesteps.to(self._device), noise.to(self._device)
+
+    def _own(self, views: GuidanceViews | AppearanceViews, timesteps: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        share = own_share(views)[0]
+        own = slice(share.start // self._views, share.stop // self._views)
+        return timesteps[own], noise[own]

@@ -2,19 +2,12 @@
 
 An entry of `VARIANTS` each, with its own settings: `guidance.variant = {kind = "ism", interval = 0.1}`.
 
-Symbols as in `sds`; g is the gradient with respect to z, z_hat the clean latents it pulls towards. e(text) is the noise
-that the network sees with the prompt, e(free) that without: with the negative prompt, and for a network that sees the
-base with the base's picture. e_hat is classifier-free guidance of the two (`sds.cfg_coefficients`).
-
-The network itself, a `Network`, may predict e, v or z and take 4, 8 or 9 channels; no variant knows which.
+Symbols as in `sds` and `query`; g is the gradient with respect to z, z_hat the clean latents it pulls towards.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Collection
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -22,181 +15,11 @@ from torch import Tensor
 
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.registry import Registry
-from fd_mitsuba.conventions import Weighting
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.critic import Critic
-
-Pass = Literal["guided", "text", "free"]
-
-
-class Variant(ABC):
-    """Makes a gradient for clean latents of what the network sees.
-
-    Attributes:
-        passes: the network's passes that `gradient` asks for: `guided` (those of classifier-free guidance), `text`,
-            `free` (that without the prompt).
-        learns: there is a `Query.critic`, which learns what the latents are like.
-        settings: its own, as the registry has checked them.
-    """
-
-    passes: ClassVar[tuple[Pass, ...]] = ("guided",)
-    learns: ClassVar[bool] = False
-
-    def __init__(self, settings: Any) -> None:
-        self.settings = settings
-
-    @abstractmethod
-    def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
-        """g with respect to z, and the clean latents z_hat to show; both (n, 4, L, L), on the network's device."""
-
+from fd_mitsuba.guidance.query import Query, Variant
 
 VARIANTS: Registry[type[Variant]] = Registry("variants", "guidance variant")
 """Called with their settings."""
-
-
-@dataclass(frozen=True)
-class Distillation:
-    """How the gradient is made in one phase; the names are those of the settings."""
-
-    variant: Variant
-    weighting: Weighting
-    guidance_scale: float
-    image_guidance_scale: float
-    timestep_range: tuple[float, float]
-    perp_neg: float = 0.0
-    critic: Critic | None = None
-    """For a variant that `learns`."""
-
-
-@dataclass(frozen=True)
-class Area:
-    """A place in the pictures with texts of its own.
-
-    Attributes:
-        mask: (n, 1, L, L) in [0, 1]; of all areas together at most 1.
-        texts: pass -> (n, length, width), of the passes whose text differs from the chunk's.
-    """
-
-    mask: Tensor
-    texts: dict[str, Tensor]
-
-    def rows(self, rows: slice) -> Area:
-        """The area in some of the pictures."""
-        return Area(self.mask[rows], {name: text[rows] for name, text in self.texts.items()})
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """What the network needs for some pictures: all (n, ...), on its device, without gradients.
-
-    `mask` (n, 1, L, L) of zeros and ones confines noise and gradient; None: they are everywhere. `areas` have texts of
-    their own: there the network's noise is what it sees with these. `control` (n, 3, H, H) is for a ControlNet,
-    `cameras` (n, 16) for a network that sees several views at once; its groups are consecutive and whole.
-    """
-
-    z: Tensor
-    noise: Tensor
-    timesteps: Tensor
-    texts: dict[str, Tensor]
-    condition: Tensor | None
-    mask: Tensor | None
-    areas: tuple[Area, ...] = ()
-    control: Tensor | None = None
-    cameras: Tensor | None = None
-
-
-class Network(Protocol):
-    """What the variants ask of `denoiser.Denoiser`."""
-
-    @property
-    def has_image_pass(self) -> bool: ...
-
-    @property
-    def alpha_bars(self) -> Tensor: ...
-
-    def predict_noise(
-        self,
-        z_t: Tensor,
-        timesteps: Tensor,
-        texts: dict[str, Tensor],
-        condition: Tensor | None,
-        control: Tensor | None = None,
-        cameras: Tensor | None = None,
-    ) -> dict[str, Tensor]: ...
-
-
-@dataclass(frozen=True)
-class Query:
-    """One chunk before one network: what the variants are written with."""
-
-    network: Network
-    chunk: Chunk
-    how: Distillation
-
-    @property
-    def free(self) -> str:
-        return free_pass(self.network.has_image_pass)
-
-    @property
-    def noise(self) -> Tensor:
-        """The drawn noise, where the mask lets it."""
-        return self.chunk.noise if self.chunk.mask is None else self.chunk.noise * self.chunk.mask
-
-    def alpha_bar(self, timesteps: Tensor) -> Tensor:
-        return self.network.alpha_bars[timesteps]
-
-    def weights(self) -> Tensor:
-        """w(t) at the drawn timesteps."""
-        return sds.weight(self.how.weighting, self.alpha_bar(self.chunk.timesteps))
-
-    def noised(self, timesteps: Tensor) -> Tensor:
-        """z with the drawn noise at these levels."""
-        return sds.add_noise(self.chunk.z, self.noise, self.alpha_bar(timesteps))
-
-    def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
-        """Noise of each named pass: e + sum over areas of mask (e(area's text) - e)."""
-        texts = {name: text for name, text in self.chunk.texts.items() if name in names}
-        if missing := set(names) - set(texts):
-            raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
-        known = self.chunk.condition, self.chunk.control, self.chunk.cameras
-        seen = self.network.predict_noise(z_t, timesteps, texts, *known)
-        merged = dict(seen)
-        for area in self.chunk.areas:
-            own = {name: area.texts[name] for name in texts if name in area.texts}
-            if not own:
-                continue
-            for name, noise in self.network.predict_noise(z_t, timesteps, own, *known).items():
-                merged[name] = merged[name] + area.mask * (noise - seen[name])
-        return merged
-
-    def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
-        """e_hat: classifier-free guidance; with `perp_neg` less scale perp_neg perp(e(negative) - e(free)).
-
-        perp: what is perpendicular to e(text) - e(free), which read no negative prompt then (arXiv 2304.04968).
-        """
-        how, with_image = self.how, self.network.has_image_pass
-        coefficients = guidance_coefficients(how, with_image)
-        seen = self.passes(z_t, timesteps, _guided_passes(how, with_image))
-        noise_hat = sds.combine(seen, coefficients)
-        if how.perp_neg == 0:
-            return noise_hat
-        free = seen[self.free]
-        away = sds.perpendicular(seen["negative"] - free, seen["text"] - free)
-        return noise_hat - how.guidance_scale * how.perp_neg * away
-
-    def criticised(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
-        """The noise that the critic sees with the prompt."""
-        assert self.how.critic is not None
-        with self.how.critic.acting():
-            return self.passes(z_t, timesteps, ("text",))["text"]
-
-    def move(self, z_t: Tensor, noise_hat: Tensor, now: Tensor, to: Tensor) -> Tensor:
-        """A DDIM step to the levels `to`, up or down. Outside the mask z stays what it is, without noise."""
-        moved = sds.ddim_step(z_t, noise_hat, self.alpha_bar(now), self.alpha_bar(to))
-        if self.chunk.mask is None:
-            return moved
-        outside = sds.add_noise(self.chunk.z, torch.zeros_like(moved), self.alpha_bar(to))
-        return torch.where(self.chunk.mask > 0, moved, outside)
 
 
 @VARIANTS.register("sds")
@@ -323,30 +146,3 @@ class VariationalScore(Variant):
         noise_hat = query.guided(z_t, timesteps)
         preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
         return sds.sds_gradient(noise_hat, query.criticised(z_t, timesteps), query.weights()), preview
-
-
-def free_pass(has_image_pass: bool) -> str:
-    """Name of the pass without the prompt: a network that is guided by the base's image, too, still sees it there."""
-    return "image" if has_image_pass else "plain"
-
-
-def guidance_coefficients(how: Distillation, has_image_pass: bool) -> dict[str, float]:
-    """The passes of classifier-free guidance with their coefficients."""
-    if has_image_pass:
-        return sds.cfg_coefficients_with_image(how.guidance_scale, how.image_guidance_scale)
-    return sds.cfg_coefficients(how.guidance_scale)
-
-
-def _guided_passes(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
-    """Names of the passes that `Query.guided` asks for."""
-    names = tuple(guidance_coefficients(how, has_image_pass))
-    if how.perp_neg == 0:
-        return names
-    return tuple(dict.fromkeys((*names, "text", "negative", free_pass(has_image_pass))))
-
-
-def passes_of(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
-    """Names of all passes that the variant asks for; a pass without weight is left out."""
-    free = (free_pass(has_image_pass),)
-    names = {"guided": _guided_passes(how, has_image_pass), "text": ("text",), "free": free}
-    return tuple(dict.fromkeys(name for asked in how.variant.passes for name in names[asked]))

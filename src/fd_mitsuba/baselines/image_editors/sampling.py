@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.denoiser import Denoiser
 
 FIRST, LAST = 0.98, 0.02
@@ -47,7 +48,7 @@ def sample(
     for index, time in enumerate(times):
         now = torch.full((count,), time, device=denoiser.device)
         level = denoiser.alpha_bars[now]
-        seen = denoiser.predict_noise(z.float(), now, texts, condition)
+        seen = denoiser.predict_noise(z.float(), now, texts, Beside(condition))
         noise_hat = sds.combine(seen, coefficients)
         last = index + 1 == len(times)
         following = None if last else denoiser.alpha_bars[torch.full_like(now, times[index + 1])]

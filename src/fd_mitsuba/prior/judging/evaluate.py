@@ -14,6 +14,7 @@ from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.prior.pictures.corpus import Pair
 from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
@@ -67,7 +68,7 @@ def draw_samples(
         repeated = now.repeat(len(base))
         if mask is not None:
             z = torch.where(mask > 0, z, guidance.alpha_bars[now].sqrt() * base)
-        noise = sds.combine(guidance.predict_noise(z, repeated, texts, base), passes)
+        noise = sds.combine(guidance.predict_noise(z, repeated, texts, Beside(base)), passes)
         z = sds.ddim_step(z, noise, guidance.alpha_bars[repeated], guidance.alpha_bars[following.repeat(len(base))])
     return z if mask is None else torch.where(mask > 0, z, base)
 
