@@ -52,6 +52,7 @@ mutants: $(STAMP) llvm
 bench: $(STAMP) llvm
 	$(PY) benchmarks/geometry_step.py --json
 	$(PY) benchmarks/appearance_step.py --json
+	$(PY) benchmarks/full_size_steps.py --json
 	$(PY) benchmarks/export_part.py --json
 	$(PY) benchmarks/guidance_call.py --json
 

@@ -13,7 +13,7 @@ import diffusers
 import pytest
 import safetensors.torch
 import torch
-from tiny_guidance import load
+from tiny_guidance import components_of, load
 from tiny_pipelines import save_pipeline
 
 from fd_mitsuba.config import GuidanceConfig
@@ -645,9 +645,10 @@ def test_no_memory_is_not_taken_for_a_damaged_file(
 
 
 def test_words_are_checked_where_the_tokenizer_knows_whole_words(folders: dict[str, Path]) -> None:
-    guidance = load(folders["sd15"])
-    assert guidance.set_prompt("a dragon") == []
-    guidance.conventions = guidance.conventions.model_copy(update={"whole_words": True})
+    assert load(folders["sd15"]).set_prompt("a dragon") == []
+    components = components_of(folders["sd15"])
+    conventions = components.conventions.model_copy(update={"whole_words": True})
+    guidance = DiffusionGuidance(replace(components, conventions=conventions), GuidanceConfig())
     assert guidance.set_prompt("a horse with a dragon", "blurry") == ["dragon"]
 
 

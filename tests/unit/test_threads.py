@@ -36,6 +36,19 @@ def test_pictures_get_the_cores_and_give_them_back(monkeypatch: pytest.MonkeyPat
     assert dr.thread_count() == before
 
 
+def test_steps_with_large_pictures_get_all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    def counts() -> tuple[int, int]:
+        return dr.thread_count(), torch.get_num_threads()
+
+    before = counts()
+    monkeypatch.setattr(threads, "_cores", max(before) + 1)
+    with threads.step_threads(4 * 256**2 * 2):
+        assert counts() == before, "the built-in prior's refined steps"
+    with threads.step_threads(4 * 512**2 * 2):
+        assert counts() == (max(before) + 1,) * 2
+    assert counts() == before
+
+
 def test_the_renderer_shares_only_where_there_are_cores_to_spare() -> None:
     assert [threads.renderer_threads(cores) for cores in (1, 2, 3, 8)] == [1, 1, 2, 7]
 

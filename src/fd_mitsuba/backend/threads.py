@@ -8,7 +8,8 @@ as with one thread each. So
 * torch runs the small operations of a geometry step on one thread, and takes more only inside `network_threads()`,
   around a diffusion model;
 * Dr.Jit stays on one thread where there are at most two cores: a second one made a quiet machine's step a fifth faster
-  at best, and 1.5 to 2.7 times as slow as soon as anything else ran. With more cores it leaves one to the rest.
+  at best, and 1.5 to 2.7 times as slow as soon as anything else ran. With more cores it leaves one to the rest;
+* steps with large pictures give both all cores, in turns (`step_threads`).
 
 Each step also makes and drops arrays of some ten megabytes. The allocator is told to keep them instead of handing them
 back to the system, which would clear them again page by page: 8 % of a step on the grid of 128 cells a side.
@@ -28,6 +29,8 @@ from fd_mitsuba.backend.processes import started_with_others
 from fd_mitsuba.backend.startup import DEFAULT_VARIANT, start
 from fd_mitsuba.errors import UserError
 
+LARGE_PICTURES = 1 << 20
+"""Samples of a step from which a second thread is worth more than it costs: four views of 512 pixels have them."""
 _FEW_CORES = 2
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 _KEPT_BYTES = 1 << 29
@@ -151,6 +154,23 @@ def rendering_threads() -> Iterator[None]:
     import drjit as dr
 
     with _all_cores(dr.thread_count, dr.set_thread_count):
+        yield
+
+
+@contextmanager
+def step_threads(samples: int) -> Iterator[None]:
+    """While open, both pools have all the cores given to `share_cores`, for a step with large pictures.
+
+    They take turns, and kernels of a tenth of a second and more are worth waking threads for. Steps with less than
+    `LARGE_PICTURES` samples, as those of the built-in prior, keep their one thread.
+
+    Args:
+        samples: of all pictures of the step in this process.
+    """
+    if samples < LARGE_PICTURES:
+        yield
+        return
+    with rendering_threads(), network_threads():
         yield
 
 

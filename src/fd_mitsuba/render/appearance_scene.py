@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,6 +16,7 @@ from fd_mitsuba.backend.startup import FACES, VERTICES
 from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.render.film_extent import hull_corners
 from fd_mitsuba.render.part_shading import CHANNELS, PartShading, bounce_shading
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.mesh_source import ANALYTIC
@@ -86,6 +88,11 @@ class AppearanceScene:
         visible = _scene([*base, *meshes]) if lamps or around else lit
         _keep_at_distance(lights, [*loaded.shapes(), *around], scene)
         return cls(lit, visible, meshes, tuple(base))
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """Points whose convex hull holds all that is visible, (V, 3)."""
+        return hull_corners(self.visible)
 
     def set_vertex_values(self, part: int, values: Mapping[str, np.ndarray]) -> None:
         """What further bounces see on a part: BSDF values, field -> (V, C), one row for each of its vertices."""

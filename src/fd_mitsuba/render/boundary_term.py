@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
-from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.conventions import NormalSpace
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.mesh_tracer import Hit
@@ -25,45 +22,16 @@ _NEARER = 1e-4
 """What lies in front of an outline point by more than this share of its depth hides it."""
 
 
-@dataclass(frozen=True)
-class UploadedPoints:
-    """`OutlinePoints` in Dr.Jit."""
-
-    view: mi.UInt32
-    film: mi.Point2f
-    beside: mi.Point2f
-    """Film points just outside the outline."""
-    outwards: mi.Vector2f
-    vertices: tuple[mi.UInt32, mi.UInt32]
-    along: mi.Float
-    depth: mi.Float
-    length: mi.Float
-
-    def __len__(self) -> int:
-        return dr.width(self.view)
-
-
-def upload_points(points: OutlinePoints, size: int) -> UploadedPoints:
-    """At least one point, on the outline in pictures of `size` pixels a side."""
-    film = mi.Point2f(upload_floats(points.film[:, 0]), upload_floats(points.film[:, 1]))
-    outwards = mi.Vector2f(upload_floats(points.outwards[:, 0]), upload_floats(points.outwards[:, 1]))
-    return UploadedPoints(
-        upload_indices(points.view),
-        film,
-        film + (_STEP_ASIDE * size) * outwards,
-        outwards,
-        (upload_indices(points.vertices[:, 0]), upload_indices(points.vertices[:, 1])),
-        upload_floats(points.along),
-        upload_floats(points.depth),
-        upload_floats(points.length),
-    )
+def film_beside(points: OutlinePoints, size: int) -> mi.Point2f:
+    """Film points just outside the outline, in pictures of `size` pixels a side."""
+    return points.film + (_STEP_ASIDE * size) * points.outwards
 
 
 def add_boundary_term(
     picture: list[mi.Float],
     mesh: ShadedMesh,
     cameras: FilmCameras,
-    points: UploadedPoints,
+    points: OutlinePoints,
     behind: Hit,
     space: NormalSpace,
 ) -> None:
@@ -77,10 +45,10 @@ def add_boundary_term(
     Args:
         picture: five arrays of B size^2 pixels, changed in place.
         points: on the outline of `mesh`, in pictures of the same size.
-        behind: what is seen at `points.beside`.
+        behind: what is seen at `film_beside` of them.
     """
     camera = cameras.at(points.view)
-    beside = camera.ray(points.beside)
+    beside = camera.ray(film_beside(points, cameras.size))
     visible = behind.depth > points.depth * (1 - _NEARER)
     film, view, along, (first, second) = points.film, points.view, points.along, points.vertices
     with dr.suspend_grad():

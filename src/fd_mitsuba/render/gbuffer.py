@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import torch
 
 from fd_mitsuba.backend import bridge
+from fd_mitsuba.backend.upload import upload_indices
 from fd_mitsuba.render.appearance_scene import AppearanceScene
 from fd_mitsuba.render.cameras import FilmCameras
+from fd_mitsuba.render.film_extent import pixels_within
 from fd_mitsuba.render.film_samples import LightNumbers, film_position, light_numbers, opaque_seed
 
 
@@ -99,8 +102,9 @@ def trace(
         deferred_base: the field shades the base, too; `part_mask` is still the part's.
     """
     size, count = views.size, views.count
+    pixels = pixels_within(scene.corners, views)
     with dr.suspend_grad():
-        lane = dr.arange(mi.UInt32, count * size**2 * spp)
+        lane = _lanes(pixels, count * size**2, spp)
         hit = scene.visible.ray_intersect_preliminary(_rays(views, lane, spp, opaque_seed(seed)), coherent=True)
         seen, part = hit.is_valid(), mi.UInt32(0)
         is_part = mi.Bool(False)
@@ -109,12 +113,11 @@ def trace(
             is_part, part = is_part | this, dr.select(this, number, part)
         is_part &= seen
         deferred = seen if deferred_base else is_part
-        dr.eval(hit, is_part, part, seen)
-        part_samples, base_samples = (_some(hit, dr.compress(which)) for which in (deferred, seen & ~deferred))
-        alpha, part_mask = (
-            bridge.to_torch(dr.block_sum(dr.select(which, mi.Float(1), 0), spp) / spp).reshape(count, 1, size, size)
-            for which in (seen, is_part)
-        )
+        dr.eval(lane, hit, is_part, part, seen)
+        of_part, of_base = (dr.compress(which) for which in (deferred, seen & ~deferred))
+        part_samples, base_samples = (_some(hit, lane, index) for index in (of_part, of_base))
+        alpha, part_mask = (_share(which, pixels, views, spp) for which in (seen, is_part))
+        part = dr.gather(mi.UInt32, part, of_part)
         points, normals, pixel, number = _first_points(part_samples, part, views, spp, seed)
     scale, centre = to_canonical
     return GBuffer(
@@ -141,8 +144,23 @@ def _rays(views: FilmCameras, lane: mi.UInt32, spp: int, seed: mi.UInt32) -> mi.
     return mi.Ray3f(ray.o, dr.normalize(ray.d))
 
 
-def _some(hit: mi.PreliminaryIntersection3f, lane: mi.UInt32) -> Samples:
-    chosen = dr.gather(mi.PreliminaryIntersection3f, hit, lane)
+def _lanes(pixels: np.ndarray, every: int, spp: int) -> mi.UInt32:
+    """The numbers of all samples of some of `every` pixel."""
+    lane = dr.arange(mi.UInt32, len(pixels) * spp)
+    if len(pixels) == every:
+        return lane
+    return dr.gather(mi.UInt32, upload_indices(pixels), lane // spp) * spp + lane % spp
+
+
+def _share(which: mi.Bool, pixels: np.ndarray, views: FilmCameras, spp: int) -> torch.Tensor:
+    """(B, 1, size, size): the share of each pixel's samples for which it is true, given for some of the pixels."""
+    film = torch.zeros(views.count * views.size**2)
+    film[torch.from_numpy(pixels)] = bridge.to_torch(dr.block_sum(dr.select(which, mi.Float(1), 0), spp) / spp)
+    return film.reshape(views.count, 1, views.size, views.size)
+
+
+def _some(hit: mi.PreliminaryIntersection3f, lane: mi.UInt32, index: mi.UInt32) -> Samples:
+    chosen, lane = dr.gather(mi.PreliminaryIntersection3f, hit, index), dr.gather(mi.UInt32, lane, index)
     dr.eval(chosen, lane)
     return Samples(lane, chosen)
 
@@ -163,7 +181,7 @@ def _first_points(
     ray = _rays(views, lane, spp, opaque_seed(seed))
     surface = hit.compute_surface_interaction(ray, mi.RayFlags.All)
     position, normal = surface.p, surface.sh_frame.n
-    place, number = lane // spp, dr.gather(mi.UInt32, part, lane)
+    place, number = lane // spp, dr.gather(mi.UInt32, part, first)
     dr.eval(position, normal, place, number)
     points, normals = (torch.stack([bridge.to_torch(axis) for axis in v], dim=1) for v in (position, normal))
     return points, normals, bridge.indices_to_torch(place), bridge.indices_to_torch(number)

@@ -11,7 +11,7 @@ import torch
 from fd_mitsuba.backend import bridge, startup
 from fd_mitsuba.backend.upload import upload_indices
 from fd_mitsuba.conventions import GEOMETRY_CHANNELS, NormalSpace
-from fd_mitsuba.render.boundary_term import add_boundary_term, upload_points
+from fd_mitsuba.render.boundary_term import add_boundary_term, film_beside
 from fd_mitsuba.render.cameras import FilmCameras
 from fd_mitsuba.render.enclosing import is_closed, is_outside
 from fd_mitsuba.render.film_samples import film_position, opaque_seed
@@ -105,11 +105,11 @@ class GeometryPass:
             closed = is_closed(surface.faces)
             if wanted:
                 outline = find_outline(mesh.faces, views, uploaded, closed)
-                drawn = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
-                if len(drawn.view):
-                    points = upload_points(drawn, self.size)
+                points = sample_outline(outline, views.count, self.silhouette_spp * self.size**2, seed)
+                if points is not None:
+                    beside = film_beside(points, self.size)
                     view = dr.concat([view, points.view])
-                    film = mi.Point2f(*(dr.concat([a, b]) for a, b in zip(film, points.beside, strict=True)))
+                    film = mi.Point2f(*(dr.concat([a, b]) for a, b in zip(film, beside, strict=True)))
             from_outside = closed and is_outside(views.position, mesh.vertices)
             hit = self._tracer.see(views, film, view, uploaded, from_outside)
             picture = self._shade(surface, views, self.spp, seed, hit.part(0, pixel_samples))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.backend.processes import processes
+from fd_mitsuba.backend.threads import step_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
@@ -123,6 +124,11 @@ class AppearanceStage:
         Raises:
             RunStopped: a value that is not finite.
         """
+        views = self.config.appearance.views // processes().count
+        with step_threads(views * self.rendering.size**2 * self.rendering.spp):
+            return self._step(step)
+
+    def _step(self, step: int) -> StepRecord:
         settings = self.config.appearance
         cameras, closeup = self.cameras(step)
         share = processes().share(len(cameras))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.backend.processes import processes
+from fd_mitsuba.backend.threads import step_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.active_vertices import active_vertices
@@ -138,8 +139,19 @@ class GeometryStage:
         Raises:
             RunStopped: a value that is not finite, a field that explodes, a part that stays invisible.
         """
+        with step_threads(self._samples(self.phase_of(step)[0])):
+            return self._step(step)
+
+    def _samples(self, phase: Phase) -> int:
+        """How many a step renders in this process."""
+        if self.guidance is None or self.config.geometry.lambda_sds == 0:
+            return 0
+        views, rendered = self.config.geometry.views // processes().count, self._pass(self._passes, phase)
+        return views * rendered.size**2 * (rendered.spp + rendered.silhouette_spp)
+
+    def _step(self, step: int) -> StepRecord:
         geometry = self.config.geometry
-        phase, phase_step, phase_length = self.phase_of(step)
+        phase = self.phase_of(step)[0]
         cameras, closeup = self.cameras(step)
         samples = self.field_losses.draw(step)
         surface = self.extractor(self.field, self.field_losses.with_tethers(samples))
