@@ -64,7 +64,7 @@ class LinearGuidance:
 def make_steps(only: str | None, overrides: list[str]) -> dict[str, Callable[[int], Any]]:
     """Kind of step -> what makes a step of a number."""
     from fd_mitsuba.config import RunConfig
-    from fd_mitsuba.scene.edit_scene import load_edit_scene
+    from fd_mitsuba.scene.load_scene import load_edit_scene
     from fd_mitsuba.training.appearance_stage import AppearanceStage
     from fd_mitsuba.training.geometry_stage import GeometryStage
 

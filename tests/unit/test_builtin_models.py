@@ -17,7 +17,7 @@ from fd_mitsuba.guidance.loading import locate
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.understood_prompt import understood_prompt
 from fd_mitsuba.runs.check import check_scene
-from fd_mitsuba.runs.cost import unet_weights
+from fd_mitsuba.runs.network_size import network_size
 from fd_mitsuba.scene.load_scene import load_edit_scene
 
 FINE = "guidance.model=builtin-fine"
@@ -37,7 +37,7 @@ def test_the_fine_one_gets_the_quick_settings() -> None:
 
 def test_its_weights_are_counted_right() -> None:
     size = (FINE_FOLDER / "unet" / "diffusion_pytorch_model.safetensors").stat().st_size
-    assert unet_weights("builtin-fine")[0] == pytest.approx(size / 2, rel=0.02)
+    assert network_size("builtin-fine").weights == pytest.approx(size / 2, rel=0.02)
 
 
 def test_a_part_that_only_the_fine_one_knows() -> None:

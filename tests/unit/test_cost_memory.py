@@ -8,18 +8,23 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import diffusers
 import numpy as np
 import pytest
 import torch
 import trimesh
 from conftest import INTEGRATOR
 from PIL import Image
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import UserError, out_of_memory
+from fd_mitsuba.guidance.critic import Critic
+from fd_mitsuba.guidance.memory import critic_bytes
 from fd_mitsuba.runs import cost_memory
 from fd_mitsuba.runs.cost_memory import check_memory_mb, memory_warning, refuse_too_many_samples, run_memory
+from fd_mitsuba.runs.network_size import NetworkSize, network_size
 from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.load_scene import load_edit_scene
 
@@ -27,6 +32,7 @@ Make = Callable[..., Path]
 ROOT = Path(__file__).resolve().parents[2]
 CAT = SceneSize(17012, 512 * 256, 1_916_928)
 BOTH = ("geometry", "appearance")
+BUILTIN = network_size("builtin")
 
 # What changes of the cat with configs/quick.toml, and the peak of the resident set of the whole run in MiB, measured
 # on 2 cores with `VmHWM`; None where it was not measured.
@@ -51,15 +57,15 @@ PEAKS = {
 def test_peaks_that_were_measured(name: str) -> None:
     size, overrides, whole, geometry = PEAKS[name]
     config = RunConfig.load(ROOT / "configs" / "quick.toml", overrides)
-    assert sum(run_memory(size, config, BOTH, 7e6).values()) == pytest.approx(whole, rel=0.15)
+    assert sum(run_memory(size, config, BOTH, BUILTIN).values()) == pytest.approx(whole, rel=0.15)
     if geometry is not None:
-        assert sum(run_memory(size, config, ("geometry",), 7e6).values()) == pytest.approx(geometry, rel=0.15)
+        assert sum(run_memory(size, config, ("geometry",), BUILTIN).values()) == pytest.approx(geometry, rel=0.15)
 
 
 def test_peaks_of_a_smoke_run() -> None:
     config = RunConfig.load(ROOT / "configs" / "smoke.toml", ["output.turntable_frames=2"])
-    assert sum(run_memory(CAT, config, BOTH, 7e6).values()) == pytest.approx(1191, rel=0.15)
-    assert sum(run_memory(CAT, config, ("geometry",), 7e6).values()) == pytest.approx(909, rel=0.15)
+    assert sum(run_memory(CAT, config, BOTH, BUILTIN).values()) == pytest.approx(1191, rel=0.15)
+    assert sum(run_memory(CAT, config, ("geometry",), BUILTIN).values()) == pytest.approx(909, rel=0.15)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +113,7 @@ def test_every_cause_is_named_where_it_is_the_largest(make_scene: Make, monkeypa
 
     def said(left: float, size: SceneSize = CAT, *overrides: str) -> str | None:
         monkeypatch.setattr(cost_memory, "available_bytes", lambda: int(left * 1e9))
-        return memory_warning(scene, run_memory(size, RunConfig.load(None, list(overrides)), BOTH, 860e6))
+        return memory_warning(scene, run_memory(size, RunConfig.load(None, list(overrides)), BOTH, NetworkSize()))
 
     assert said(40) is None
     builtin = ("guidance.model=builtin", "appearance.spp=8")
@@ -134,7 +140,7 @@ def test_every_cause_is_named_where_it_is_the_largest(make_scene: Make, monkeypa
 def test_networks_on_another_device_are_not_held_here() -> None:
     def forecast(*overrides: str) -> float:
         config = RunConfig.load(None, ["guidance.model=somebody/model", *overrides])
-        return sum(run_memory(CAT, config, BOTH, 860e6).values())
+        return sum(run_memory(CAT, config, BOTH, NetworkSize()).values())
 
     assert forecast("guidance.device=cuda") < forecast() - 5000
     assert forecast("guidance.views_per_call=1") < forecast() - 3000
@@ -182,3 +188,46 @@ def test_a_run_that_cannot_fit_is_refused_before_it_starts(make_scene: Make, tmp
     assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
     assert "GB of memory at its peak" in done.stderr and "are for output.texture_size" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def saved_by_the_critic(unet: dict[str, object], side: int, dtype: torch.dtype) -> tuple[int, int]:
+    """Bytes that autograd keeps for the way back through a full-width UNet, and the critic's values; nothing is run."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            network = diffusers.UNet2DConditionModel(**unet).requires_grad_(False).eval()
+            critic = Critic(network, 4, 1e-4)
+            own = {weight.untyped_storage()._cdata for weight in network.parameters()}
+            kept: dict[int, torch.Tensor] = {}
+
+            def keep(value: torch.Tensor) -> torch.Tensor:
+                if value.untyped_storage()._cdata not in own:
+                    kept[value.untyped_storage()._cdata] = value
+                return value
+
+            texts = torch.randn(1, 77, network.config.cross_attention_dim, dtype=dtype)
+            with torch.autograd.graph.saved_tensors_hooks(keep, lambda value: value), critic.acting():
+                network(torch.randn(1, 4, side, side, dtype=dtype), torch.tensor([5]), texts)
+            values = sum(matrix.numel() for matrix in critic._matrices.values())
+            return sum(value.untyped_storage().nbytes() for value in kept.values()), values
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize(("side", "dtype"), [(96, "float32"), (64, "bfloat16")])
+def test_the_critic_of_vsd_is_counted(side: int, dtype: str) -> None:
+    unet = {"block_out_channels": (320, 640, 1280, 1280), "cross_attention_dim": 768, "attention_head_dim": 8}
+    kept, values = saved_by_the_critic(unet, side, getattr(torch, dtype))
+    assert critic_bytes(unet, side, 3, dtype, 4) == pytest.approx(3 * kept + 16 * values, rel=0.05)
+    assert critic_bytes(unet, side, 3, dtype, 0) == 0
+
+
+def test_the_forecast_and_the_guard_know_of_the_critic() -> None:
+    def forecast(*more: str) -> float:
+        config = RunConfig.load(None, ["guidance.model=somebody/model", "guidance.views_per_call=4", *more])
+        return sum(run_memory(CAT, config, BOTH, NetworkSize()).values()) * 2**20
+
+    learned = critic_bytes({}, 64, 2, "float32", 4)
+    assert forecast("guidance.variant=vsd") - forecast() == pytest.approx(learned) and learned > 3e9
+    assert forecast("guidance.variant=vsd", "guidance.device=cuda") == forecast("guidance.device=cuda")

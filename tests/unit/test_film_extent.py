@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from fd_mitsuba.render.cameras import FilmCameras
-from fd_mitsuba.render.film_extent import hull_corners, pixels_within
-from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.backend import startup
+
+mi = startup.start()
+
+from fd_mitsuba.render.cameras import FilmCameras  # noqa: E402
+from fd_mitsuba.render.film_extent import hull_corners, pixels_within  # noqa: E402
+from fd_mitsuba.scene.views import CameraBatch  # noqa: E402
 
 SIZE, SAMPLES = 48, 9
 

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from plain_outline import plain_points
 
-from fd_mitsuba.render.outline import Outline
-from fd_mitsuba.render.outline_points import sample_outline
+from fd_mitsuba.backend import startup
+
+startup.start()
+
+from fd_mitsuba.render.outline import Outline  # noqa: E402
+from fd_mitsuba.render.outline_points import sample_outline  # noqa: E402
 
 
 def outline(views: list[int], seed: int = 0) -> Outline:

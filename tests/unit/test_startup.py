@@ -114,7 +114,7 @@ def test_a_path_given_by_the_user_is_checked(tmp_path: Path, monkeypatch: pytest
     ("call", "reason"),
     [
         ("variant='llvm_rgb'", "variant 'llvm_rgb': unknown to this Mitsuba; choose one of"),
-        ("variant='scalar_rgb'", "variant 'scalar_rgb': gradients on the CPU need"),
+        ("variant='scalar_rgb'", "variant 'scalar_rgb': gradients need an llvm_ad_* variant"),
         ("threads=-1", "threads = -1"),
     ],
 )
@@ -124,6 +124,20 @@ def test_bad_arguments_give_one_line(call: str, reason: str) -> None:
         f"try: a.start({call})\nexcept UserError as error: print(error)"
     )
     assert result.stdout.startswith(reason) and result.stdout.count("\n") == 1 and result.stderr == ""
+
+
+@pytest.mark.parametrize("given", [{}, {"DRJIT_LIBLLVM_PATH": "/nowhere.so"}])
+def test_a_card_that_is_not_there_is_one_line(given: dict[str, str]) -> None:
+    """Whether or not an LLVM is found: a CUDA variant does not need it."""
+    result = run(
+        "from fd_mitsuba.backend import startup as a\nfrom fd_mitsuba.errors import UserError\n"
+        "try: a.start('cuda_ad_rgb'); print('there is a card')\nexcept UserError as error: print(error)",
+        **given,
+    )
+    if "there is a card" in result.stdout:
+        pytest.skip("this machine has a card")
+    assert result.stdout.startswith("variant 'cuda_ad_rgb': Dr.Jit finds no NVIDIA card"), result.stderr
+    assert result.stdout.count("\n") == 1 and "use llvm_ad_rgb" in result.stdout
 
 
 def test_another_variant_in_the_same_process_is_refused() -> None:

@@ -1,7 +1,8 @@
 """The only crossing between torch and Dr.Jit: whole tensors, once per pass.
 
 Torch hosts the fields and the guidance; Dr.Jit differentiates what Mitsuba traced. `differentiable` runs a Dr.Jit
-function on copies of torch tensors and appears to torch as one differentiable operation.
+function on copies of torch tensors and appears to torch as one differentiable operation. Fields and pictures are on the
+CPU, wherever Mitsuba renders: with a CUDA variant the copies cross over to the card and back.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ DrJitFunction = Callable[..., "mi.Float"]
 
 def to_drjit(tensor: torch.Tensor) -> mi.Float:
     """A flat Dr.Jit copy, detached. A copy, because Dr.Jit would otherwise see torch's later in-place changes."""
-    return upload_floats(tensor.detach().to(torch.float32).numpy())
+    return upload_floats(tensor.detach().to("cpu", torch.float32).numpy())
 
 
 def to_torch(array: mi.Float) -> torch.Tensor:
-    """A flat float32 torch copy of evaluated values."""
-    return array.torch().clone()
+    """A flat float32 copy of evaluated values, on the CPU."""
+    return array.torch().to("cpu", copy=True)
 
 
 def indices_to_torch(array: mi.UInt32) -> torch.Tensor:
-    """A flat int64 torch copy of evaluated whole numbers below 2^31."""
-    return mi.Int32(array).torch().to(torch.int64)
+    """A flat int64 copy of evaluated whole numbers below 2^31, on the CPU."""
+    return mi.Int32(array).torch().to("cpu", torch.int64, copy=True)
 
 
 def differentiable(function: DrJitFunction, *tensors: torch.Tensor) -> torch.Tensor:

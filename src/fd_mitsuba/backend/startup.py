@@ -6,6 +6,7 @@ Mitsuba's own kernels. So the library is chosen here first; `import drjit` and `
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -21,6 +22,8 @@ OLDEST_LLVM = 16
 """LLVM 14 is refused by Dr.Jit 1.5; 15 cannot compile `fminimum` on x86 and aborts the process."""
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
+
+NO_CARD = "Dr.Jit finds no NVIDIA card, or no driver of version 535 or newer for it"
 
 VERTICES = "vertex_positions"
 FACES = "faces"
@@ -94,33 +97,41 @@ def start(variant: str = DEFAULT_VARIANT, threads: int = 0) -> ModuleType:
     """The module `mitsuba`, with its variant set, its log quiet and its thread pool sized. May be called again.
 
     Args:
-        variant: an LLVM variant with derivatives.
+        variant: with derivatives: `llvm_ad_*` on the CPU, `cuda_ad_*` on an NVIDIA card (never tried on one).
         threads: cores to use, the calling thread included; 0 keeps the present number (at first all cores).
 
     Raises:
-        UserError: unknown variant, unsuitable variant, another variant already set, negative `threads`, no usable LLVM.
+        UserError: unknown variant, unsuitable variant, another variant already set, negative `threads`, no usable LLVM,
+            no card for a CUDA variant.
     """
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
+    on_card = variant.startswith("cuda_ad_")
     if "drjit" not in sys.modules:
-        choose_llvm()
+        with contextlib.suppress(UserError) if on_card else contextlib.nullcontext():
+            choose_llvm()
     import drjit as dr
     import mitsuba as mi
 
     if variant not in mi.variants():
         raise UserError(f"variant {variant!r}: unknown to this Mitsuba; choose one of {', '.join(mi.variants())}")
-    if not variant.startswith("llvm_ad_"):
-        raise UserError(f"variant {variant!r}: gradients on the CPU need an llvm_ad_* variant; use {DEFAULT_VARIANT}")
+    if not variant.startswith(("llvm_ad_", "cuda_ad_")):
+        raise UserError(
+            f"variant {variant!r}: gradients need an llvm_ad_* variant, or cuda_ad_* on an NVIDIA card; use "
+            f"{DEFAULT_VARIANT}"
+        )
     current = mi.variant()
     if current is None:
         try:
             mi.set_variant(variant)
         except ImportError as error:
+            if on_card:
+                raise UserError(f"variant {variant!r}: {NO_CARD}; use {DEFAULT_VARIANT}") from None
             path = os.environ.get("DRJIT_LIBLLVM_PATH")
             raise UserError(f"LLVM: Dr.Jit refused {path} ({error}); {_REMEDY}") from None
     elif current != variant:
         raise UserError(f"variant {variant!r}: {current} is already in use in this process; start a new one")
-    version = dr.detail.llvm_version()
+    version = (OLDEST_LLVM, 0, 0) if on_card else dr.detail.llvm_version()
     if version[0] < OLDEST_LLVM:  # Dr.Jit was imported before us and chose for itself
         raise UserError(f"LLVM: Dr.Jit already loaded version {version[0]}; import fd_mitsuba first, or {_REMEDY}")
     mi.set_log_level(mi.LogLevel.Error)  # non-manifold meshes would print themselves whole at every step
@@ -130,6 +141,13 @@ def start(variant: str = DEFAULT_VARIANT, threads: int = 0) -> ModuleType:
     if threads:
         dr.set_thread_count(threads)
     return mi
+
+
+def renders_on_card() -> bool:
+    """Whether the variant that is set renders on a card, with OptiX in place of Embree."""
+    import mitsuba as mi
+
+    return (mi.variant() or DEFAULT_VARIANT).startswith("cuda_")
 
 
 def _candidates() -> list[Path]:

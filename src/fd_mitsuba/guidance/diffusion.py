@@ -28,6 +28,7 @@ from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, Guida
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.guidance.multiview import camera_conditions
+from fd_mitsuba.guidance.network_passes import rows_at_once
 from fd_mitsuba.guidance.normal_augmentation import random_turns, turned
 from fd_mitsuba.guidance.picture_gradient import StepPictures, picture_gradient
 from fd_mitsuba.guidance.picture_latents import PictureLatents
@@ -245,7 +246,7 @@ class DiffusionGuidance(Denoiser):
             mask,
             total,
         )
-        rows = max(1, self.config.views_per_call // len(step.texts) // together) * together
+        rows = rows_at_once(self.config.views_per_call, len(step.texts), together)
         found = picture_gradient(step, self, self.latents, self.conditions, how, phase, rows)
         if self.critic is not None and lesson is not None and found.pictures is not None:
             self.critic.take_step()

@@ -29,10 +29,12 @@ from fd_mitsuba.guidance.layout import (
 )
 from fd_mitsuba.guidance.learned_words import add_word
 from fd_mitsuba.guidance.lora import add_lora
-from fd_mitsuba.guidance.memory import BYTES, require_memory, working_set_bytes
+from fd_mitsuba.guidance.memory import BYTES, critic_bytes, require_memory, working_set_bytes
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
 from fd_mitsuba.guidance.multiview import join_views
 from fd_mitsuba.guidance.multiview_layout import ORIGINAL_CLASS, converted_unet, multiview_conventions, unet_config
+from fd_mitsuba.guidance.network_passes import rows_at_once
+from fd_mitsuba.guidance.variants import critic_rank
 from fd_mitsuba.io.hub import hub_snapshot, is_offline, local_folder
 
 HUB_FILES = ["model_index.json", FILE_NAME, "tokenizer/*", "scheduler/*.json"] + [
@@ -95,16 +97,13 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     size = BYTES[config.dtype]
     text_size = size if torch.device(device).type == "cpu" else 0
     latent_size = latent_side(configs["unet"])
+    most, together = config.views_per_call, conventions.views_together or 1
+    working = working_set_bytes(configs["unet"], configs["vae"], latent_size, most, config.dtype, together)
+    taught = rows_at_once(most, 2, together)
+    working += critic_bytes(configs["unet"], latent_size, taught, config.dtype, critic_rank(config))
     require_memory(
         (counts["unet"] + control_weights) * size + counts["text_encoder"] * text_size + counts["vae"] * 4,
-        working_set_bytes(
-            configs["unet"],
-            configs["vae"],
-            latent_size,
-            config.views_per_call,
-            config.dtype,
-            conventions.views_together or 1,
-        ),
+        working,
         device,
         str(folder),
     )

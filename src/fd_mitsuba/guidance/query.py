@@ -43,6 +43,17 @@ class Variant(ABC):
     def __init__(self, settings: Any) -> None:
         self.settings = settings
 
+    def asked(self, timestep_range: tuple[float, float], together: int) -> dict[Pass, float]:
+        """How often each kind of pass is run for a picture in a step, on average; for the forecast of a run's time.
+
+        A pass backward counts as one more: the network's weights are constant, so that it costs as much as one forward.
+
+        Args:
+            timestep_range: from which timesteps are drawn, as shares of all.
+            together: pictures that are worked on at once and wait for each other.
+        """
+        return dict.fromkeys(self.passes, 1.0)
+
     @abstractmethod
     def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
         """g with respect to z, and the clean latents z_hat to show; both (n, 4, L, L), on the network's device."""
@@ -201,8 +212,16 @@ def _guided_passes(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*names, "text", "negative", free_pass(has_image_pass))))
 
 
+def pass_names(how: Distillation, has_image_pass: bool) -> dict[Pass, tuple[str, ...]]:
+    """Names of the network's passes behind each kind; a pass without weight is left out."""
+    return {
+        "guided": _guided_passes(how, has_image_pass),
+        "text": ("text",),
+        "free": (free_pass(has_image_pass),),
+    }
+
+
 def passes_of(how: Distillation, has_image_pass: bool) -> tuple[str, ...]:
-    """Names of all passes that the variant asks for; a pass without weight is left out."""
-    free = (free_pass(has_image_pass),)
-    names = {"guided": _guided_passes(how, has_image_pass), "text": ("text",), "free": free}
+    """Names of all passes that the variant asks for."""
+    names = pass_names(how, has_image_pass)
     return tuple(dict.fromkeys(name for asked in how.variant.passes for name in names[asked]))

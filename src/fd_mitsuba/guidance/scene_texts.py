@@ -75,11 +75,21 @@ class SceneTexts:
         for part, (prompt, negative) in self.of_parts.items():
             if part not in views.regions:
                 raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
-            own = {"text"} if negative in ("", self._negative_prompt) else set(passes)
-            if self._config.perp_neg:
-                own &= {"text", "negative"}
+            own = own_passes(negative, self._negative_prompt, self._config.perp_neg, passes)
             mask = tile_views(views.regions[part], self._conventions.view_grid).to(self._device)
-            names = [name for name in passes if name in own]
-            texts = self.embeddings(self.prompts(views, prompt), names, negative)
+            texts = self.embeddings(self.prompts(views, prompt), own, negative)
             found.append(Area(adaptive_avg_pool2d(mask, self._latent_size), texts))
         return tuple(found)
+
+
+def own_passes(negative: str, of_scene: str, perp_neg: float, passes: Iterable[str]) -> list[str]:
+    """Those of the network's passes in which a part with a prompt and a negative prompt reads something of its own.
+
+    Args:
+        negative: the part's; "" is that of the scene.
+        of_scene: the scene's.
+    """
+    own = {"text"} if negative in ("", of_scene) else set(passes)
+    if perp_neg:
+        own &= {"text", "negative"}
+    return [name for name in passes if name in own]

@@ -13,10 +13,10 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from fd_mitsuba.config import Section
+from fd_mitsuba.config import GuidanceConfig, Section
 from fd_mitsuba.config.registry import Registry
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.query import Query, Variant
+from fd_mitsuba.guidance.query import Pass, Query, Variant
 
 VARIANTS: Registry[type[Variant]] = Registry("variants", "guidance variant")
 """Called with their settings."""
@@ -69,6 +69,17 @@ class IntervalScore(Variant):
     passes = ("guided", "free")
     settings: IntervalSettings
 
+    def asked(self, timestep_range: tuple[float, float], together: int) -> dict[Pass, float]:
+        """Strides up to the highest s of the pictures at hand, of t that are evenly distributed."""
+        low, high = timestep_range
+        interval, stride = self.settings.interval, self.settings.inversion_step
+        width, strides, begin = max(high - low, 1e-9), 0.0, 0.0
+        while begin < high - interval:  # one more stride is taken where any s lies beyond
+            below = min(max((begin + interval - low) / width, 0.0), 1.0)
+            strides += 1 - below**together
+            begin += stride
+        return {"guided": 1.0, "free": 1.0 + strides}
+
     def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
         last, own = len(query.network.alpha_bars) - 1, self.settings
         interval, stride = (max(1, round(share * last)) for share in (own.interval, own.inversion_step))
@@ -105,6 +116,10 @@ class Reconstruction(Variant):
 
     settings: ReconstructionSettings
 
+    def asked(self, timestep_range: tuple[float, float], together: int) -> dict[Pass, float]:
+        """One pass of each kind for a step of DDIM."""
+        return {"guided": float(self.settings.steps)}
+
     def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
         now, steps = query.chunk.timesteps, self.settings.steps
         z_t = query.noised(now)
@@ -140,9 +155,19 @@ class VariationalScore(Variant):
     learns = True
     settings: VariationalSettings
 
+    def asked(self, timestep_range: tuple[float, float], together: int) -> dict[Pass, float]:
+        """What the critic sees, and its lesson forward and back."""
+        return {"guided": 1.0, "text": 3.0}
+
     def gradient(self, query: Query) -> tuple[Tensor, Tensor]:
         timesteps = query.chunk.timesteps
         z_t = query.noised(timesteps)
         noise_hat = query.guided(z_t, timesteps)
         preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
         return sds.sds_gradient(noise_hat, query.criticised(z_t, timesteps), query.weights()), preview
+
+
+def critic_rank(config: GuidanceConfig) -> int:
+    """Rank of the critic that the variant of these settings learns with; 0: it has none."""
+    variant = VARIANTS.make(config.variant, "guidance.variant")
+    return variant.settings.rank if variant.learns else 0

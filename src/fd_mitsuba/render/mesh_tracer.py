@@ -10,7 +10,8 @@ Building the ray-tracing hierarchy could cost more than everything else in a pas
   spatial splits, 2.7 microseconds a face, and that of a group without, 0.5 microseconds; rays take the same time and
   see the same.
 
-The scenes are updated in place: one that is loaded anew at every step leaks.
+The scenes are updated in place: one that is loaded anew at every step leaks. On a card OptiX builds hierarchies itself,
+and nothing is drawn: all rays are traced, and no shape group is needed.
 
     face number   0 . . . . . static_faces | . . . . . . . . . . . . . . . . . F
     scene         `_static`, built once    | `_moving`, built when `trace` asks; or none of it (drawn), and
@@ -25,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from fd_mitsuba.backend.startup import FACES, VERTICES
+from fd_mitsuba.backend.startup import FACES, VERTICES, renders_on_card
 from fd_mitsuba.backend.upload import upload_floats, upload_indices
 from fd_mitsuba.render.cameras import FilmCamera, FilmCameras
 from fd_mitsuba.render.face_raster import edge_planes, nearest_faces, sort_points
@@ -62,7 +63,8 @@ class MeshTracer:
 
     def __init__(self) -> None:
         self._static = _UpdatableScene(quick_build=False)
-        self._moving, self._large = _UpdatableScene(quick_build=True), _UpdatableScene(quick_build=True)
+        quick = not renders_on_card()
+        self._moving, self._large = _UpdatableScene(quick_build=quick), _UpdatableScene(quick_build=quick)
         self._static_key: tuple[np.ndarray, np.ndarray] | None = None
         self._static_faces = mi.UInt32(0)
         self._moving_mesh = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
@@ -113,7 +115,7 @@ class MeshTracer:
         """
         with dr.suspend_grad():
             dr.eval(film, view)
-            if dr.width(view) > _POINTS_PER_FACE * len(self._moving_mesh[1]):
+            if renders_on_card() or dr.width(view) > _POINTS_PER_FACE * len(self._moving_mesh[1]):
                 return self.trace(cameras.at(view).ray(film), coherent=True)
         return self.draw(cameras, film, view, mesh, from_outside)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +12,10 @@ from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.interface import Phase
+from fd_mitsuba.guidance.network_passes import network_passes
 from fd_mitsuba.runs.cost_memory import memory_warning, run_memory
+from fd_mitsuba.runs.network_size import network_size
 from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import union_sdf
@@ -94,15 +95,15 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     surface = 4e-7 * 8.6 * vertices ** (2 / 3)
     builtin = is_builtin(guidance.model)
     cores = min(cores_in_use(), _MOST_CORES_OF_USE)
-    side = latent_size(guidance.model)
+    network = network_size(guidance.model)
+    side, weights = (32 if builtin else network.latent_size), network.weights
     refined = 1 - geometry.coarse_fraction
     coarse_rays = 3e-7 * geometry.views * side**2 * (geometry.spp + geometry.silhouette_spp)
     refined_rays = 3e-7 * geometry.views * (8 * side) ** 2 * (1 + geometry.silhouette_spp)
-    weights, source = unet_weights(guidance.model)
     slower = _GFLOPS * 1e9 / processor_speed()
     guided = geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
     speed = None if builtin or not guided else _speed(guidance)
-    passes = geometry.views * _passes(scene, guidance, guidance.guidance_scale)
+    passes = (1 - refined) * _passes(scene, config, "coarse") + refined * _passes(scene, config, "refined")
     if speed is None:
         encoder = 0.0082 * slower * (0.75 + 0.5 / cores)  # four views are one picture to it; measured with two cores
         forward = encoder * (_FINER if guidance.model == BUILTIN_FINE else 1.0)
@@ -119,14 +120,14 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
         "that Mitsuba's kernels are in its cache: a first run compiles them, some 20 s more",
         *([] if speed is None else [speed.text]),
         f"a base of {size.faces} faces, light of {more_light:.3g} million pixels",
-        f"a UNet of {weights / 1e6:.3g} million weights ({source})",
+        f"a UNet of {weights / 1e6:.3g} million weights ({network.source})",
         f"{queries} queries of the part's field a step",
     )
     # The run leaves the appearance stage out where its prior knows no faces of a cut.
     left_out = builtin and scene.subtracts and config.appearance.lambda_sds > 0
     stages = ("geometry",) if left_out else STAGES
-    shape_memory = sum(run_memory(size, config, ("geometry",), weights, side).values())
-    terms = run_memory(size, config, stages, weights, side)
+    shape_memory = sum(run_memory(size, config, ("geometry",), network).values())
+    terms = run_memory(size, config, stages, network)
     try:
         warning = memory_warning(scene, terms) or ""
     except UserError as error:
@@ -176,15 +177,15 @@ def _speed(guidance: GuidanceConfig) -> _Speed:
     return _Speed(unet, vae, f"networks on {device} at {rates}, {how}")
 
 
-def _passes(scene: EditScene, guidance: GuidanceConfig, scale: float) -> int:
-    """Passes of the network a view: with and without the prompt, and what negative and parts' own prompts add."""
-    own = scene.part_prompts.values()
-    passes = (2 if scale != 1 else 1) + len(own)
-    if guidance.perp_neg > 0:
-        passes += 1
-    if scale != 1 or guidance.perp_neg > 0:
-        passes += sum(text.negative_prompt not in ("", scene.negative_prompt) for text in own)
-    return passes
+def _passes(scene: EditScene, config: RunConfig, phase: Phase) -> float:
+    """Passes of the network in a step of a phase, for all its views."""
+    guidance, lit = config.guidance, phase == "appearance"
+    negatives = [text.negative_prompt for text in scene.part_prompts.values()]
+    views = (config.appearance if lit else config.geometry).views
+    with_image = network_size(guidance.model, lit).has_image_pass
+    return views * network_passes(
+        phase, guidance, config.appearance, with_image, views, scene.negative_prompt, negatives
+    )
 
 
 def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encoder: float, slower: float) -> float:
@@ -200,36 +201,15 @@ def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encode
     settings = config.appearance
     builtin = is_builtin(config.guidance.model)
     guided = settings.lambda_sds > 0
-    side = settings.picture_size or ((32 if builtin else 8 * latent_size(config.guidance.model)) if guided else 128)
+    side = settings.picture_size or (
+        (32 if builtin else 8 * network_size(config.guidance.model).latent_size) if guided else 128
+    )
     samples = settings.views * side**2 * settings.spp
     depth = settings.max_depth if settings.max_depth > 0 else 8
     light = slower * 1.3e-7 * samples * (1 + 0.5 * (depth - 2))
-    passes = settings.views * _passes(scene, config.guidance, settings.guidance_scale)
+    passes = _passes(scene, config, "appearance")
     if config.guidance.controlnet:
         passes *= 1 + _CONTROLNET
     # A prior in pixels needs no encoder; it is shown the part in clay as well.
     image = passes * forward + (0.3 * light if builtin else settings.views * encoder)
     return slower * (0.05 + (0.03 if settings.style else 0.0)) + light + (image if guided else 0.0)
-
-
-def unet_weights(model: str) -> tuple[float, str]:
-    """How many parameters the UNet of a guidance model has, and how that is known."""
-    folder = Path(model) / "unet"
-    files = list(folder.glob("*.safetensors")) or list(folder.glob("*.bin"))
-    if files:
-        size = max(file.stat().st_size for file in files)
-        return size / (2 if ".fp16." in files[0].name else 4), f"from {folder}"
-    if is_builtin(model):
-        return 7.0e6, "the built-in prior"
-    return 860e6, "as Stable Diffusion 1.5; the model is not in a local folder"
-
-
-def latent_size(model: str) -> int:
-    """Side of the latents that a guidance model's UNet was made for; 64 where no local folder says another."""
-    if is_builtin(model):
-        return 32
-    try:
-        config = json.loads((Path(model) / "unet" / "config.json").read_text(encoding="utf-8"))
-        return int(config.get("sample_size") or config["image_size"])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return 64

@@ -14,8 +14,11 @@ from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.config.sections import FieldConfig, OutputConfig, TextureConfig
 from fd_mitsuba.conventions import BASE_NAME
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance.memory import available_bytes, held_bytes
+from fd_mitsuba.guidance.memory import BYTES, available_bytes, critic_bytes, held_bytes
+from fd_mitsuba.guidance.network_passes import rows_at_once
+from fd_mitsuba.guidance.variants import critic_rank
 from fd_mitsuba.render.geometry_pass import RAYS_AT_ONCE
+from fd_mitsuba.runs.network_size import NetworkSize
 from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
@@ -47,15 +50,12 @@ def check_memory_mb(size: SceneSize) -> float:
     return _IMPORTS + 20 + sum(_scene_terms(size, "check").values())
 
 
-def run_memory(
-    size: SceneSize, config: RunConfig, stages: tuple[str, ...], unet_weights: float, latent_size: int = 64
-) -> dict[str, float]:
+def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], network: NetworkSize) -> dict[str, float]:
     """Setting or input -> what it adds to the peak of a run, in units of 2^20 bytes; "any run" is the rest.
 
     Args:
         stages: `geometry`, `appearance` or both.
-        unet_weights: parameters of the guidance model's UNet.
-        latent_size: side of its latents; plays no part for the built-in prior.
+        network: the guidance model's UNet.
     """
     lit = "appearance" in stages
     terms = {"any run": _IMPORTS + _SHAPE + (_MATERIAL if lit else 0.0)}
@@ -66,11 +66,11 @@ def run_memory(
     grid = (config.geometry.grid_resolution + 1) ** 3
     terms["geometry.grid_resolution"] = _PER_GRID_VERTEX * (grid - _USUAL_GRID) / _MIB
     terms["field.log2_table"] = _PER_TABLE_BYTE * _table_bytes(config.field) / _MIB
-    terms["guidance.model"] = _guidance(config, stages, unet_weights, latent_size)
+    terms["guidance.model"] = _guidance(config, stages, network)
     terms["output.turntable_size"] = _ring(config.output)
     if lit:
         settings, output = config.appearance, config.output
-        side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 8 * latent_size)
+        side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 8 * network.latent_size)
         step = settings.views * side**2 * settings.spp
         photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
         name = "output.picture_size" if photograph >= step else "appearance.spp"
@@ -149,15 +149,15 @@ def _ring(output: OutputConfig) -> float:
     return (_PER_RAY * portion + _PER_FRAME_PIXEL * (pixels - _USUAL_FRAME_PIXELS)) / _MIB
 
 
-def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float, latent_size: int) -> float:
-    guidance = config.guidance
+def _guidance(config: RunConfig, stages: tuple[str, ...], network: NetworkSize) -> float:
+    guidance, weights, latent_size = config.guidance, network.weights, network.latent_size
     wanted = [config.geometry.lambda_sds > 0] * ("geometry" in stages)
     wanted += [config.appearance.lambda_sds > 0] * ("appearance" in stages)
     if not any(wanted):
         return 0.0
     if is_builtin(guidance.model):
         return _BUILTIN
-    size = {"float32": 4, "bfloat16": 2, "float16": 2}[guidance.dtype]
+    size = BYTES[guidance.dtype]
     if guidance.controlnet:
         weights *= 1.42  # it has 361 million beside the 860 of Stable Diffusion 1.5
     text = 4 * 123e6  # the text encoder stays on the CPU, and so does its float32
@@ -165,7 +165,9 @@ def _guidance(config: RunConfig, stages: tuple[str, ...], weights: float, latent
         return (text + weights * size) / _MIB  # loaded here before it is moved
     # As `guidance.memory` demands: weights with the VAE, one call of the UNet, the encoder's maps for half of it.
     calls = 65e6 * size * guidance.views_per_call + 3300e6 * max(1, guidance.views_per_call // 2)
-    return (text + weights * size + 4 * 84e6 + (latent_size / 64) ** 2 * calls) / _MIB
+    taught = rows_at_once(guidance.views_per_call, 2)
+    critic = critic_bytes({}, latent_size, taught, guidance.dtype, critic_rank(guidance))
+    return (text + weights * size + 4 * 84e6 + (latent_size / 64) ** 2 * calls + critic) / _MIB
 
 
 def _table_bytes(field: FieldConfig | TextureConfig) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from importlib import metadata
 from typing import NamedTuple
 
+from fd_mitsuba.backend.startup import NO_CARD
 from fd_mitsuba.backend.threads import available_cores
 from fd_mitsuba.errors import UserError
 
@@ -32,6 +33,7 @@ def examine() -> list[Finding]:
         Finding("cores", True, f"{available_cores()} of {os.cpu_count()} may be used"),
         _attempt("llvm", _llvm),
         _attempt("mitsuba", _mitsuba),
+        Finding("rendering on a card", True, _card()),
         _attempt("torch", _torch),
         _attempt(
             "diffusers", lambda: f"{metadata.version('diffusers')}, transformers {metadata.version('transformers')}"
@@ -66,10 +68,23 @@ def _mitsuba() -> str:
     return f"{mi.__version__}, variant {mi.variant()}, a test kernel ran"
 
 
+def _card() -> str:
+    """Nothing to mend where there is none: runs render on the CPU."""
+    try:
+        import drjit as dr
+
+        found = dr.has_backend(dr.JitBackend.CUDA)
+    except (ImportError, RuntimeError, AttributeError):
+        found = False
+    return "-m cuda_ad_rgb can be chosen; it was never tried" if found else NO_CARD
+
+
 def _torch() -> str:
     import torch
 
-    return str(torch.__version__)
+    devices = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    found = f"cuda: {', '.join(devices)}" if devices else "no cuda device for guidance.device"
+    return f"{torch.__version__}, {found}"
 
 
 def _prior() -> str:

@@ -35,7 +35,6 @@ from fd_mitsuba.runs.appearance_outcome import (
     write_appearance,
 )
 from fd_mitsuba.runs.choices import checked_choices
-from fd_mitsuba.runs.cost import latent_size, unet_weights
 from fd_mitsuba.runs.cost_memory import memory_warning, run_memory
 from fd_mitsuba.runs.follower import refuse_guidance_alone
 from fd_mitsuba.runs.geometry_outcome import (
@@ -48,6 +47,7 @@ from fd_mitsuba.runs.geometry_outcome import (
     take_geometry,
 )
 from fd_mitsuba.runs.levels import checked_levels, level_folder, remove_other_levels, within_budget
+from fd_mitsuba.runs.network_size import network_size
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
 from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
@@ -133,8 +133,7 @@ def run(
         with_geometry = "geometry" in stages and geometry_from is None
         for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):
             say(line)
-        size, weights = SceneSize.of(scene), unet_weights(config.guidance.model)[0]
-        terms = run_memory(size, config, tuple(stages), weights, latent_size(config.guidance.model))
+        terms = run_memory(SceneSize.of(scene), config, tuple(stages), network_size(config.guidance.model))
         if warning := memory_warning(scene, terms):
             say(warning)
         # Nothing is written before the guidance is there: a wrong model name must not leave a folder that is taken.
