@@ -14,7 +14,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs import doctor
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ["python", "cores", "llvm", "mitsuba", "torch", "diffusers", "built-in prior", "memory"]
+NAMES = ["python", "cores", "llvm", "mitsuba", "rendering on a card", "torch", "diffusers", "built-in prior", "memory"]
 
 
 def run_doctor(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -35,6 +35,9 @@ def test_json_on_this_machine() -> None:
     for name in ("python", "cores", "llvm", "mitsuba", "torch", "diffusers", "memory"):
         assert report[name]["ok"], report[name]
     assert "LLVM" in report["llvm"]["found"] and "a test kernel ran" in report["mitsuba"]["found"]
+    card = report["rendering on a card"]
+    assert card["ok"] and ("cuda_ad_rgb" in card["found"] or "finds no NVIDIA card" in card["found"])
+    assert "cuda" in report["torch"]["found"]
     assert done.returncode == (0 if report["built-in prior"]["ok"] else 1)
 
 

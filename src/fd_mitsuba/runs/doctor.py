@@ -70,12 +70,10 @@ def _mitsuba() -> str:
 
 def _card() -> str:
     """Nothing to mend where there is none: runs render on the CPU."""
-    try:
-        import drjit as dr
-
-        found = dr.has_backend(dr.JitBackend.CUDA)
-    except (ImportError, RuntimeError, AttributeError):
-        found = False
+    dr = sys.modules.get("drjit")  # imported with Mitsuba, unless that failed: a missing LLVM would be told twice
+    if dr is None:
+        return "unknown until Mitsuba starts"
+    found = dr.has_backend(dr.JitBackend.CUDA)
     return "-m cuda_ad_rgb can be chosen; it was never tried" if found else NO_CARD
 
 
