@@ -423,6 +423,69 @@ def coff() -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
+def box_3ds() -> bytes:
+    """Chunks in chunks, z upwards: a box of triangles with UVs, its material and image, a colour of 0..255."""
+
+    def chunk(kind: int, *content: bytes) -> bytes:
+        body = b"".join(content)
+        return struct.pack("<HI", kind, 6 + len(body)) + body
+
+    points, _, uvs = box_quads()
+    faces = np.concatenate([box_triangles(), np.full((12, 1), 7)], axis=1).astype("<u2")
+    image = chunk(0xA200, chunk(0x0030, struct.pack("<h", 100)), chunk(0xA300, b"BOX_PICTURE.PNG\0"))
+    material = chunk(0xAFFF, chunk(0xA000, b"paint\0"), chunk(0xA020, chunk(0x0011, bytes([200, 200, 200]))), image)
+    own = chunk(0x4130, b"paint\0", struct.pack("<H", 12), np.arange(12, dtype="<u2").tobytes())
+    mesh = chunk(
+        0x4100,
+        chunk(0x4110, struct.pack("<H", 24), points.astype("<f4").tobytes()),
+        chunk(0x4140, struct.pack("<H", 24), np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1).astype("<f4").tobytes()),
+        chunk(0x4120, struct.pack("<H", 12), faces.tobytes(), own),
+    )
+    return chunk(0x4D4D, chunk(0x3D3D, material, chunk(0x4000, b"box\0", mesh)))
+
+
+def box_dae() -> bytes:
+    """Quads with UVs of their own, in centimetres, an image through surface and sampler, moved by its node."""
+    points, _, _ = box_quads()
+    corners = " ".join(f"{4 * side + k} {k}" for side in range(6) for k in range(4))
+    places = " ".join(f"{value:g}" for value in points.ravel())
+    uvs = " ".join(f"{u:g} {1 - v:g}" for u, v in UV_TOP)
+
+    def source(name: str, values: str, axes: str) -> str:
+        count = len(values.split())
+        params = "".join(f'<param name="{axis}" type="float"/>' for axis in axes)
+        return (
+            f'<source id="{name}"><float_array id="{name}-a" count="{count}">{values}</float_array><technique_common>'
+            f'<accessor source="#{name}-a" count="{count // len(axes)}" stride="{len(axes)}">{params}</accessor>'
+            "</technique_common></source>"
+        )
+
+    return f"""<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><created>2026-01-01T00:00:00</created><modified>2026-01-01T00:00:00</modified>
+<unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
+<library_images><image id="picture"><init_from>box_picture.png</init_from></image></library_images>
+<library_effects><effect id="paint"><profile_COMMON>
+<newparam sid="s"><surface type="2D"><init_from>picture</init_from></surface></newparam>
+<newparam sid="t"><sampler2D><source>s</source></sampler2D></newparam>
+<technique sid="common"><lambert><diffuse><texture texture="t" texcoord="UV"/></diffuse></lambert></technique>
+</profile_COMMON></effect></library_effects>
+<library_materials><material id="m" name="paint"><instance_effect url="#paint"/></material></library_materials>
+<library_geometries><geometry id="g" name="box"><mesh>
+{source("places", places, "XYZ")}
+{source("uvs", uvs, "ST")}
+<vertices id="v"><input semantic="POSITION" source="#places"/></vertices>
+<polylist material="symbol" count="6"><input semantic="VERTEX" source="#v" offset="0"/>
+<input semantic="TEXCOORD" source="#uvs" offset="1" set="0"/>
+<vcount>4 4 4 4 4 4</vcount><p>{corners}</p></polylist></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node id="n"><translate>0 100 0</translate><scale>100 100 100</scale>
+<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="symbol" target="#m">
+<bind_vertex_input semantic="UV" input_semantic="TEXCOORD" input_set="0"/></instance_material></technique_common>
+</bind_material></instance_geometry></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#scene"/></scene></COLLADA>
+""".encode()
+
+
 def main() -> None:
     files = {
         "box.glb": box_glb(),
@@ -441,6 +504,8 @@ def main() -> None:
         **ply_corner_uvs(),
         "duck.stl": duck_stl(),
         "colours.off": coff(),
+        "box.3ds": box_3ds(),
+        "box.dae": box_dae(),
     }
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():

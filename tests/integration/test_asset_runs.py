@@ -13,7 +13,7 @@ from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.cli.main import main
 
 ASSETS = Path(__file__).parents[1] / "data" / "assets"
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3ds", ".dae")
 NAMES = sorted(path.name for path in ASSETS.iterdir() if path.suffix in SUFFIXES)
 FEW = ["figure.glb", "duck.stl"]
 REST = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name not in FEW]
