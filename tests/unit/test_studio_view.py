@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fd_mitsuba.assets.asset import Asset
 from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.io.ply import ply_bytes
 from fd_mitsuba.scene.tessellate import unit_sphere
@@ -129,6 +130,30 @@ def test_surfaces_can_be_shown_as_colours_or_normals(view: View, tmp_path: Path)
     typed(view.panel.light, "sunset", client)
     typed(view.panel.shading, "lit", client)
     assert objects._shown["base"].handle.glb_data == view.session.state.glb and client.notes == []
+
+
+def test_materials_are_tried_on_the_part_alone(view: View, tmp_path: Path) -> None:
+    """In the page: as it grows, and with its learned material, whose normal map stays; the base keeps its own."""
+    client, objects, frame = Client(), view.canvas.objects, view.session.state.regions.frame
+    learned = (Path(__file__).parents[1] / "data" / "assets" / "maps.glb").read_bytes()
+
+    def shown() -> Asset:
+        (tmp_path / "part.glb").write_bytes(objects._shown["part"].handle.glb_data)
+        return read_asset(tmp_path / "part.glb")
+
+    objects.show_part(*unit_sphere(2), frame)
+    typed(view.panel.material, "gold", client)
+    (gold,) = shown().materials
+    assert (gold.metallic, gold.roughness) == (1.0, 0.25) and gold.base_color == pytest.approx((1.0, 0.71, 0.29))
+    objects.show_part(*unit_sphere(2), frame, learned)
+    before = read_asset(Path(__file__).parents[1] / "data" / "assets" / "maps.glb")
+    assert any(material.base_texture for material in before.materials)
+    for material, own in zip(shown().materials, before.materials, strict=True):
+        assert material.metallic == 1.0 and material.base_texture is None
+        assert (material.normal_texture is None) == (own.normal_texture is None)
+    assert objects._shown["base"].handle.glb_data == view.session.state.glb
+    typed(view.panel.material, "as learned", client)
+    assert objects._shown["part"].handle.glb_data == learned and client.notes == []
 
 
 def test_a_part_has_words_of_its_own(view: View) -> None:

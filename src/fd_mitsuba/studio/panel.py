@@ -20,7 +20,7 @@ from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.plain_text import escaped
 from fd_mitsuba.studio.run_panel import RunPanel
-from fd_mitsuba.studio.shading import SHADINGS
+from fd_mitsuba.studio.shading import MATERIALS, SHADINGS
 from fd_mitsuba.studio.uploads import PATH
 
 if TYPE_CHECKING:
@@ -71,6 +71,9 @@ class Panel(ActionPanel):
                 self._gui.add_checkbox(name, visible[name]).on_update(self._do("visibility"))
             self.shading = self._gui.add_dropdown("Shown as", SHADINGS)
             self.shading.on_update(self._do("shading"))
+            tried = "tried on the part here; its own is in what is downloaded"
+            self.material = self._gui.add_dropdown("Part's material", tuple(MATERIALS), hint=tried)
+            self.material.on_update(self._do("material"))
             self.light = self._gui.add_dropdown("Light", tuple(LIGHTS), hint="of this page; a run is lit by the scene")
             self.light.on_update(self._do("light"))
 

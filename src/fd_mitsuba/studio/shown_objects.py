@@ -13,7 +13,7 @@ import numpy as np
 
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-from fd_mitsuba.studio.shading import COLOURS, LIT, NORMALS, normals_glb, unlit
+from fd_mitsuba.studio.shading import COLOURS, LIT, MATERIALS, NORMALS, OWN, dressed, normals_glb, solid_glb, unlit
 
 if TYPE_CHECKING:
     import viser
@@ -54,6 +54,7 @@ class ShownObjects:
         self.base_hidden = False
         """Whether the part's GLB has the base in it."""
         self.shading = LIT
+        self.material = OWN
 
     @property
     def has_part(self) -> bool:
@@ -101,6 +102,12 @@ class ShownObjects:
         for name, shown in list(self._shown.items()):
             self._draw(name, shown)
 
+    def set_material(self, name: str) -> None:
+        """Show the part in one of `shading.MATERIALS`; not what has been cut, whose base has its own."""
+        self.material = name
+        if "part" in self._shown:
+            self._draw("part", self._shown["part"])
+
     def apply(self) -> None:
         """Show and hide what `visible` says."""
         for name, shown in self._shown.items():
@@ -122,15 +129,20 @@ class ShownObjects:
         self._draw(name, new)
 
     def _draw(self, name: str, shown: _Shown) -> None:
+        tried = MATERIALS[self.material] if name == "part" and not self.base_hidden else None
         with self._server.atomic():
             if self.shading == NORMALS:
                 shown.handle = self._scene.add_glb(f"/{name}", normals_glb(shown.vertices, shown.faces))
+            elif shown.glb is None and tried is not None:
+                glb = solid_glb(shown.vertices, shown.faces, tried)
+                shown.handle = self._scene.add_glb(f"/{name}", unlit(glb) if self.shading == COLOURS else glb)
             elif shown.glb is None:
                 shown.handle = self._scene.add_mesh_simple(
                     f"/{name}", shown.vertices, shown.faces, color=_PART, side="double"
                 )
             else:
-                frame, glb = shown.frame, unlit(shown.glb) if self.shading == COLOURS else shown.glb
+                frame, glb = shown.frame, shown.glb if tried is None else dressed(shown.glb, tried)
+                glb = unlit(glb) if self.shading == COLOURS else glb
                 place = -frame.scale * frame.centre
                 shown.handle = self._scene.add_glb(f"/{name}", glb, scale=frame.scale, position=place)
             if name == "base":

@@ -50,6 +50,7 @@ class View:
             "edit_again": lambda event: session.edit_again(session.shown),
             "visibility": self._visibility,
             "shading": lambda event: self._looks(self.canvas.objects.set_shading, event),
+            "material": lambda event: self._looks(self.canvas.objects.set_material, event),
             "light": lambda event: self._looks(self._light, event),
         }
         self.panel = Panel(server, session, self._heard, actions, self.canvas.visible)
