@@ -9,7 +9,7 @@ import pytest
 import torch
 from shape_checks import PLACES
 
-from fd_mitsuba.extraction.surface import UnionSurface
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.union import soft_union
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.losses.presence import loss_presence

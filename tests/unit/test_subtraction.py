@@ -14,8 +14,9 @@ from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.marching_tets import crossing_faces_plain, crossing_fraction
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
-from fd_mitsuba.extraction.surface import FAR_OUTSIDE, UnionSurface
+from fd_mitsuba.extraction.surface import FAR_OUTSIDE
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.fields.union import soft_subtract
 

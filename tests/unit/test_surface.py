@@ -10,8 +10,9 @@ import trimesh
 from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.marching_tets import crossing_faces, edge_ends
-from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.part_sdf import PartField
 
 SMALL = FieldConfig(levels=4, base_resolution=4, finest_resolution=20, log2_table=10)

@@ -19,7 +19,8 @@ from fd_mitsuba.baselines.interface import BASELINES, EditedMesh, EditTask
 from fd_mitsuba.config import Section
 from fd_mitsuba.config.bounds import Weight
 from fd_mitsuba.errors import RunStopped
-from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import FAR_OUTSIDE, SurfaceExtractor
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.guidance.interface import Phase

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.extraction.surface import UnionSurface
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.render.appearance_pass import AppearancePass
 from fd_mitsuba.render.geometry_pass import GeometryPass

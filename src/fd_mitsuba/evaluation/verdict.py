@@ -30,7 +30,7 @@ from fd_mitsuba.evaluation.part_judge import (
     load_judge,
 )
 from fd_mitsuba.evaluation.part_judge import NOTHING as JUDGED_NOTHING
-from fd_mitsuba.extraction.surface import UnionSurface
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary

@@ -7,8 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
-from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import Samples, SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
 

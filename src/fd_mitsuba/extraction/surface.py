@@ -24,10 +24,8 @@ What a surface is put together from (`fields.index_spaces` has the numbers of ve
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from fd_mitsuba.extraction.lattice_box import LatticeBox, touched_cells
@@ -35,12 +33,12 @@ from fd_mitsuba.extraction.marching_tets import (
     away_from_crossings,
     crossing_faces,
     crossing_faces_plain,
-    crossing_fraction,
     edge_ends,
     true_positions,
 )
 from fd_mitsuba.extraction.site_signs import SiteSigns
 from fd_mitsuba.extraction.tet_grid import EDGE_SLOTS, TetGrid
+from fd_mitsuba.extraction.union_surface import UnionSurface, faces_of_part, vertices_on_edges
 from fd_mitsuba.fields.index_spaces import BoxEdges, BoxVertices, GridEdges, GridVertices, Sites
 from fd_mitsuba.fields.lattice_sites import LatticeSites, SiteFeatures
 from fd_mitsuba.fields.part_sdf import PartField, PartValues
@@ -54,26 +52,6 @@ _OFFSET_CELLS = 0.5
 
 Samples = GridVertices | Callable[[Tensor], GridVertices]
 """Active vertices, or what chooses them; see `SurfaceExtractor.__call__`."""
-
-
-@dataclass(frozen=True)
-class UnionSurface:
-    """A welded triangle mesh, counter-clockwise seen from outside; empty tensors where there is no surface.
-
-    Attributes:
-        vertices: (V, 3) float32, canonical; gradients flow to the part's field.
-        faces: (F, 3) int64.
-        part_weight: (V,) in [0, 1], 0 on the base and 1 on the part, `clamp(0.5 + (sdf_part - sdf_base) / (2 spacing))`
-            at the vertex; gradients flow. Unlike a label per face it moves continuously with the seam.
-        face_is_part: (F,) bool, whether the mean of a face's part_weight exceeds 0.5.
-        sample_sdf: (S,) `sdf_part` at the samples that the caller asked for; gradients flow.
-    """
-
-    vertices: Float[Tensor, "V 3"]
-    faces: Int64[Tensor, "F 3"]
-    part_weight: Float[Tensor, " V"]
-    face_is_part: Bool[Tensor, " F"]
-    sample_sdf: Float[Tensor, " S"]
 
 
 class SurfaceExtractor:
@@ -151,7 +129,7 @@ class SurfaceExtractor:
         vertices, part_weight = self._surface_vertices(ends, values, end_sites, position.view(2, -1))
         part_weight = torch.cat([part_weight.new_zeros(len(self._static_vertices)), part_weight])
         faces = places.index_select(0, faces.view(-1)).view(-1, 3)
-        is_part = torch.cat([self._static_is_part, _faces_of_part(part_weight, faces)])
+        is_part = torch.cat([self._static_is_part, faces_of_part(part_weight, faces)])
         vertices = torch.cat([self._static_vertices, vertices])
         return UnionSurface(vertices, torch.cat([self._static_faces, faces]), part_weight, is_part, sample_sdf)
 
@@ -163,9 +141,9 @@ class SurfaceExtractor:
         union = soft_union(self.sdf_base, sdf_part, self.union_k, self.union_only_outside)
         moved = self._moved(everything, everywhere.offset)
         ends, faces = crossing_faces_plain(union.detach() > 0, self.grid.tets())
-        vertices, part_weight = self._on_edges(moved, union, sdf_part - self.sdf_base, ends.t())
+        vertices, part_weight = vertices_on_edges(moved, union, sdf_part - self.sdf_base, ends.t(), self.grid.spacing)
         sample_sdf = sdf_part[:0] if samples is None else sdf_part[samples]
-        return UnionSurface(vertices, faces, part_weight, _faces_of_part(part_weight, faces), sample_sdf)
+        return UnionSurface(vertices, faces, part_weight, faces_of_part(part_weight, faces), sample_sdf)
 
     @torch.no_grad()
     def lattice_values(self, field: PartField) -> tuple[Tensor, Tensor]:
@@ -189,7 +167,8 @@ class SurfaceExtractor:
         sdf, moved = self.lattice_values(field)
         sdf = sdf if other_sdf is None else torch.minimum(sdf, other_sdf)
         edges, faces = crossing_faces(sdf.view(self._shape) > 0)
-        return self._on_edges(moved, sdf, sdf, torch.stack(edge_ends(edges, self._shape)))[0], faces
+        ends = torch.stack(edge_ends(edges, self._shape))
+        return vertices_on_edges(moved, sdf, sdf, ends, self.grid.spacing)[0], faces
 
     @property
     def static_faces(self) -> int:
@@ -221,7 +200,7 @@ class SurfaceExtractor:
         used = GridVertices(used)
         base = self.sdf_base[used]
         positions = self.grid.positions(used, base.dtype)
-        self._static_vertices, _ = self._on_edges(positions, base, base, position)
+        self._static_vertices, _ = vertices_on_edges(positions, base, base, position, self.grid.spacing)
         cell_edges, faces = crossing_faces(inside, ~touched_cells(self._active.view(self._shape)))
         self._static_faces = torch.searchsorted(self._static_edges, cell_edges)[faces]
         self._static_is_part = torch.zeros(len(faces), dtype=torch.bool)
@@ -292,7 +271,7 @@ class SurfaceExtractor:
         offset = base.new_zeros(len(ends), 3).index_copy(0, known, values.offset.index_select(0, source))
         union = soft_union(base, sdf_part, self.union_k, self.union_only_outside)
         moved = self._box_positions.index_select(0, ends) + offset * self._box_reach.index_select(0, ends)
-        return self._on_edges(moved, union, sdf_part - base, edges)
+        return vertices_on_edges(moved, union, sdf_part - base, edges, self.grid.spacing)
 
     def _mark(self, index: GridVertices) -> Tensor:
         return torch.zeros(self.grid.count, dtype=torch.bool).index_fill_(0, index, True)
@@ -300,20 +279,3 @@ class SurfaceExtractor:
     def _moved(self, index: GridVertices, offset: Tensor) -> Tensor:
         """Positions of the grid's vertices after the offsets, (M, 3); those that must not move are exact."""
         return self.grid.positions(index, offset.dtype) + offset * self._reach[index, None].to(offset.dtype)
-
-    def _on_edges(self, positions: Tensor, sdf: Tensor, part_minus_base: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-        """Surface vertices (E, 3) and their part_weight (E,) on edges `ends` (2, E) between the given vertices."""
-        from_lower = sdf.detach().index_select(0, ends[0]) > sdf.detach().index_select(0, ends[1])
-        inner = torch.where(from_lower, ends[0], ends[1])
-        outer = torch.where(from_lower, ends[1], ends[0])
-        fraction = crossing_fraction(sdf.index_select(0, inner), sdf.index_select(0, outer), self.grid.spacing)
-        start = positions.index_select(0, inner)
-        vertices = start + fraction[:, None] * (positions.index_select(0, outer) - start)
-        inner_lead, outer_lead = part_minus_base.index_select(0, inner), part_minus_base.index_select(0, outer)
-        lead = inner_lead + fraction * (outer_lead - inner_lead)
-        return vertices, (0.5 + lead / (2 * self.grid.spacing)).clamp(0, 1)
-
-
-def _faces_of_part(part_weight: Tensor, faces: Tensor) -> Tensor:
-    first, second, third = part_weight.detach().index_select(0, faces.view(-1)).view(-1, 3).unbind(dim=1)
-    return first + second + third > 1.5

@@ -19,8 +19,9 @@ from fd_mitsuba.errors import RunStopped, UserError
 from fd_mitsuba.extraction.active_vertices import active_vertices
 from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
-from fd_mitsuba.extraction.surface import SurfaceExtractor, UnionSurface
+from fd_mitsuba.extraction.surface import SurfaceExtractor
 from fd_mitsuba.extraction.tet_grid import TetGrid
+from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField

@@ -165,3 +165,11 @@ def _turned(points: np.ndarray, shape: tuple[int, int], quarter: int) -> np.ndar
         points = np.stack([height - points[:, 1], points[:, 0]], axis=1)
         height, width = width, height
     return points
+
+
+def likely_density(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> float:
+    """Texels a unit of length, if 60 % of the texture is covered."""
+    corners = flat[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = float(np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2)
+    return texture_size * float(np.sqrt(0.6 / max(area, 1e-30)))

@@ -1,8 +1,7 @@
 """A UV atlas of a mesh: every face gets its own place in the unit square, with a gutter around each chart.
 
-    charts    `grown_charts` (few, wide) or xatlas (any mesh)     which faces lie together, and where the seams are;
-              `split_chart`, `_joined`                            of the wide ones, until all lie flat and are few
-    flat      `flattened`, or xatlas                              each chart laid flat, in the mesh's own unit
+    charts    `wide_charts` (few), or xatlas (any mesh)           which faces lie together, and where the seams are
+    flat      the same                                            each chart laid flat, in the mesh's own unit
     notches   `open_notches`, `crowded`                           places where a texel would belong to two of its faces
     packed    `packed_charts` (few), or xatlas                    all charts in the unit square, with gutters
     left out  `place_left_out`                                    faces without an area, which xatlas packs nowhere
@@ -19,21 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 import xatlas
 
-from fd_mitsuba.export.bake.chart_growth import grown_charts, split_chart
-from fd_mitsuba.export.bake.chart_notches import charts_of, crowded, open_notches
-from fd_mitsuba.export.bake.chart_packing import packed_charts
-from fd_mitsuba.export.bake.flatten import NotFlat, flattened, pinched_apart
-from fd_mitsuba.export.final_surface.mesh_rings import Edges, edges_of
+from fd_mitsuba.export.bake.chart_notches import charts_of, open_notches
+from fd_mitsuba.export.bake.chart_packing import likely_density, packed_charts
+from fd_mitsuba.export.bake.wide_charts import wide_charts
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 _FACES_AT_ONCE = 2500
 """xatlas grows charts in more than linear time: pieces of this size are quicker, and give fewer charts."""
-_FEWEST = 400
-"""Faces that a mesh must have for charts of our own."""
-_ROUNDS, _TRIES = 3, 40
-"""How often charts with narrow notches are cut in two, and how many may not lie flat before all is left to xatlas."""
-_WANTED, _NEIGHBOURS = 36, 3
-"""With more charts than that, the smallest are joined to one of so many neighbours, where that lies flat."""
 _FEW_CHARTS = 100
 """So many charts are laid one by one; more would take too long."""
 _PACKINGS = 6
@@ -80,7 +71,7 @@ def unwrap(
     vertices = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(faces, dtype=np.int64)
     vertex_map, split, flat = _charts(vertices, faces, texture_size)
-    density = _likely_density(flat, split, texture_size)
+    density = likely_density(flat, split, texture_size)
     vertex_map, split, flat = open_notches(vertices, vertex_map, split, flat, density)
     uv = _packed(flat, split, texture_size)
     vertex_map, split, uv = place_left_out(vertices, vertex_map, split, uv)
@@ -95,94 +86,7 @@ def _charts(vertices: np.ndarray, faces: np.ndarray, texture_size: int) -> tuple
 
     Few, wide charts where the surface is closed and even enough for that; else xatlas's.
     """
-    return _wide_charts(vertices, faces, texture_size) or _xatlas_charts(vertices, faces)
-
-
-def _wide_charts(
-    vertices: np.ndarray, faces: np.ndarray, texture_size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    if len(faces) < _FEWEST:
-        return None
-    try:
-        edges = edges_of(faces, len(vertices))
-    except ValueError:
-        return None
-    chart = grown_charts(vertices, faces, edges)
-    laid: dict[int, tuple[np.ndarray, ...]] = {}  # its faces, the same in its own vertices, which these are, places
-    tries, found = 0, None
-    for turn in range(_ROUNDS):
-        waiting = [number for number in np.unique(chart).tolist() if number not in laid]
-        while waiting:
-            number = waiting.pop()
-            own = np.flatnonzero(chart == number)
-            local, used = pinched_apart(faces[own])
-            try:
-                laid[number] = own, local, used, flattened(vertices[used], local)
-            except NotFlat as bad:
-                tries += 1
-                if tries > _TRIES or len(own) < 2:
-                    return None
-                apart = None if bad.apart is None else (int(own[bad.apart[0]]), int(own[bad.apart[1]]))
-                waiting += [number, int(chart.max()) + 1]
-                chart = split_chart(vertices, faces, edges, chart, number, apart)
-        vertex_map, split, flat = found = _side_by_side(faces, laid)
-        narrow = crowded(vertices[vertex_map], split, flat, _likely_density(flat, split, texture_size))
-        if not len(narrow) or turn == _ROUNDS - 1:
-            break
-        for one, other in narrow.tolist():
-            number = int(chart[one])
-            if number in laid and chart[other] == number:  # of each chart the worst place first
-                chart = split_chart(vertices, faces, edges, chart, number, (one, other))
-                del laid[number]
-    if found is not None and len(laid) > _WANTED:
-        density = _likely_density(found[2], found[1], texture_size)
-        found = _side_by_side(faces, _joined(vertices, faces, edges, chart, laid, density))
-    return found
-
-
-def _joined(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    edges: Edges,
-    chart: np.ndarray,
-    laid: dict[int, tuple[np.ndarray, ...]],
-    density: float,
-) -> dict[int, tuple[np.ndarray, ...]]:
-    """The charts with small ones joined to a neighbour where both lie flat together, until few enough are left."""
-    chart, laid = chart.copy(), dict(laid)
-    for number in sorted(laid, key=lambda x: len(laid[x][0])):
-        if len(laid) <= _WANTED:
-            break
-        near = chart[edges.faces]
-        across = (near == number).sum(axis=1) == 1
-        others, border = np.unique(near[across].sum(axis=1) - number, return_counts=True)
-        for other in others[np.argsort(-border, kind="stable")][:_NEIGHBOURS].tolist():
-            own = np.flatnonzero((chart == number) | (chart == other))
-            local, used = pinched_apart(faces[own])
-            try:
-                flat = flattened(vertices[used], local)
-            except NotFlat:
-                continue
-            if not len(crowded(vertices[used], local, flat, density)):
-                laid[other] = own, local, used, flat
-                chart[own] = other
-                del laid[number]
-                break
-    return laid
-
-
-def _side_by_side(
-    faces: np.ndarray, laid: dict[int, tuple[np.ndarray, ...]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertex map, split faces and places of charts, none of which overlaps another."""
-    split, vertex_map, places, count, corner = np.empty_like(faces), [], [], 0, 0.0
-    for own, local, used, flat in laid.values():
-        split[own] = local + count
-        vertex_map.append(used)
-        places.append(flat - flat.min(axis=0) + [corner, 0.0])
-        corner += float(np.ptp(flat[:, 0])) * 1.1
-        count += len(used)
-    return np.concatenate(vertex_map), split, np.concatenate(places)
+    return wide_charts(vertices, faces, texture_size) or _xatlas_charts(vertices, faces)
 
 
 def _xatlas_charts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -278,7 +182,7 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         laid = packed_charts(flat, faces, chart, texture_size, padding_for(texture_size))
         if laid is not None:
             return laid
-    density = _likely_density(flat, faces, texture_size)
+    density = likely_density(flat, faces, texture_size)
     best, last, best_density, upper = None, flat, 0.0, np.inf
     for _ in range(_PACKINGS):
         uv, size = _pack(flat, faces, density, padding_for(texture_size))
@@ -294,14 +198,6 @@ def _packed(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> np.ndarra
         density = wanted if inside else (best_density + upper) / 2 if np.isfinite(upper) and best_density else wanted
     # Many tiny charts: the gutters alone fill the texture. Rather a thinner gutter than none of the faces.
     return best if best is not None else last
-
-
-def _likely_density(flat: np.ndarray, faces: np.ndarray, texture_size: int) -> float:
-    """Texels a unit of length, if 60 % of the texture is covered."""
-    corners = flat[faces]
-    sides = corners[:, 1:] - corners[:, :1]
-    area = float(np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2)
-    return texture_size * float(np.sqrt(0.6 / max(area, 1e-30)))
 
 
 def _pack(flat: np.ndarray, faces: np.ndarray, density: float, padding: int) -> tuple[np.ndarray, int]:
