@@ -4,12 +4,14 @@ A row for each part of each run folder; what was the training's own surface is i
 
     angle_p5, least     smallest angles of the triangles in degrees: 5th percentile, and the smallest of all
     off, off_max        distance of points on the triangles from the function's zero set, in cells of the training
+    off_seen            the largest of those outside of the base; what is sunk in it nobody sees
     volume              outside of the base, over that of the training's surface, minus 1; sampled, to about .4 %
     meant               the same over that of the training's function, marched three times finer than the training does
     noise               mean angle in degrees between the shading normals and smoothed ones, outside of the base
     turn_p95            turning angle of the joint within a cell, 95th percentile, degrees; a circle of n cells: 360 / n
     sideways            the same without what the base's own surface turns
     notch               the deepest notch of the joint, in cells; curves counts closed curves
+    notch_sideways      the same without what the base's own surface bends
     charts, used        of the atlas: how many, and which share of the square they cover
     seconds             processor time of the final surface
 """
@@ -81,6 +83,7 @@ def measure(folder: Path) -> list[dict[str, Any]]:
             "least": float(angles.min()),
             "off": float(off.mean()),
             "off_max": float(off.max()),
+            "off_seen": float(off[~base.inside(points)].max(initial=0)),
             "volume": shown_volume(solid, base) / shown_volume(coarse, base) - 1,
             "meant": shown_volume(solid, base) / shown_volume(meant_solid(function, lattice), base) - 1,
             "noise": surface_noise(solid.vertices, shown_faces(solid, base), part.normals),
@@ -92,6 +95,7 @@ def measure(folder: Path) -> list[dict[str, Any]]:
             "sideways": percentile(joint.sideways_deg),
             "turn_before": percentile(was.turning_deg),
             "notch": float(joint.notches.max(initial=0)),
+            "notch_sideways": float(joint.sideways_notches.max(initial=0)),
             "notch_before": float(was.notches.max(initial=0)),
             "gap": solid.gap(scene.base_canonical) / cell,
             "charts": len(np.unique(charts_of(atlas.faces, len(atlas.uv)))),
@@ -162,11 +166,13 @@ def main() -> None:
                 continue
             print(
                 f"{row['run']:12} faces {row['faces']:6} manifold {row['manifold']}  angle_p5 {row['angle_p5']:.1f} "
-                f"least {row['least']:.1f}  off {row['off']:.4f} max {row['off_max']:.3f}  "
+                f"least {row['least']:.1f}  off {row['off']:.4f} max {row['off_max']:.3f} "
+                f"seen {row['off_seen']:.3f}  "
                 f"volume {row['volume']:+.2%} meant {row['meant']:+.2%}  "
                 f"noise {row['noise']:.2f} ({row['noise_before']:.2f})  curves {row['curves']} "
                 f"turn_p95 {row['turn_p95']:.0f} ({row['turn_before']:.0f}) sideways {row['sideways']:.0f}  "
-                f"notch {row['notch']:.2f} ({row['notch_before']:.2f})  gap {row['gap']:.2f}  charts {row['charts']} "
+                f"notch {row['notch']:.2f} ({row['notch_before']:.2f}) sideways {row['notch_sideways']:.2f}  "
+                f"gap {row['gap']:.2f}  charts {row['charts']} "
                 f"used {row['used']:.0%}  {row['seconds']:.1f} s",
                 flush=True,
             )

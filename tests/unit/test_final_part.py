@@ -14,9 +14,9 @@ from test_surface_quality import BOX
 
 from fd_mitsuba.evaluation.joint import joint_curves, measure_joint
 from fd_mitsuba.export.final_surface import meshing
-from fd_mitsuba.export.final_surface.final_part import FinalPart, final_part, final_parts
+from fd_mitsuba.export.final_surface.final_part import FinalPart, final_part, final_parts, part_function
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
-from fd_mitsuba.export.solid.part_solid import SINK_CELLS, part_solid
+from fd_mitsuba.export.solid.part_solid import SINK_CELLS, lattice_part, part_solid
 from fd_mitsuba.extraction.grown_part import GrownPart
 from fd_mitsuba.extraction.subtraction import SubtractionExtractor
 from fd_mitsuba.extraction.surface import SurfaceExtractor
@@ -132,6 +132,34 @@ def test_the_joint_has_no_teeth_and_shows_nothing_of_what_is_hidden() -> None:
         assert radius.min() > 0.19 + 0.5 * stage.grid.spacing and np.ptp(radius) < 0.05 * stage.grid.spacing
 
 
+class Kinked(PartField):
+    """A ball whose radius goes up and down along x, with kinks between the lattice's vertices."""
+
+    def evaluate(self, points: torch.Tensor, initial_sdf: torch.Tensor) -> PartValues:
+        wave = ((points[:, 0] / 0.13 + 0.3) % 2 - 1).abs()
+        return PartValues(initial_sdf + 0.01 * wave, torch.zeros_like(points))
+
+
+def test_between_the_vertices_of_the_training_the_field_has_no_kink() -> None:
+    stage = replace(one_ball(), field=Kinked())
+    function = part_function(stage, lattice_part(stage, None), 2)
+    vertices = stage.grid.vertices.numpy()
+    vertices = vertices[np.abs(np.linalg.norm(vertices - CENTRE, axis=1) - RADIUS) < 2 * stage.grid.spacing]
+    region = torch.from_numpy(union_sdf([region for own in stage.parts.values() for region in own], vertices)).float()
+    trained = stage.field.evaluate(torch.from_numpy(vertices).float(), region).sdf.numpy()
+    assert np.abs(function.part_values(vertices, False) - trained).max() < 1e-5
+    # At its kinks the field's own slope along x jumps by 0.02 / 0.13.
+    kinks = np.stack([np.full(200, 0.7 * 0.13), np.linspace(0.75, 0.8, 200), np.linspace(-0.1, 0.1, 200)], axis=1)
+    slopes = []
+    for sign in (-1, 1):
+        at = kinks + np.array([sign * 0.002, 0, 0])
+        step = np.array([0.001, 0, 0])
+        ends = [function.part_values(at + way * step, False) - np.linalg.norm(CENTRE - at - way * step, axis=1) * -1
+                for way in (-1, 1)]  # fmt: skip
+        slopes.append((ends[1] - ends[0]) / 0.002)
+    assert np.abs(slopes[1] - slopes[0]).max() < 0.25 * 0.02 / 0.13
+
+
 def test_a_gap_is_bridged_as_the_grid_has_decided() -> None:
     stage = stage_of({"part": [((0.0, BASE_RADIUS + 0.08 + 0.2, 0.0), 0.2)]})
     part = final_part(stage, None, FACES)
@@ -152,19 +180,23 @@ def test_islands_go_and_what_floats_stays() -> None:
     assert floating.volume == pytest.approx(ball_volume(0.15), rel=0.005)
 
 
+def dent(points: torch.Tensor) -> torch.Tensor:
+    """What makes a void of about .06 radius in the middle of a ball, and nothing at its surface."""
+    return 0.4 * torch.exp(-((points - torch.tensor([0.0, 0.75, 0.0])).norm(dim=1) ** 2) / 0.08**2)
+
+
 class Hollow(PartField):
     """A ball with a ball-shaped void."""
 
     def evaluate(self, points: torch.Tensor, initial_sdf: torch.Tensor) -> PartValues:
-        void = (points - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1) - 0.1
-        return PartValues(torch.minimum(initial_sdf, void), torch.zeros_like(points))
+        return PartValues(initial_sdf - dent(points), torch.zeros_like(points))
 
 
 def test_pockets_are_filled() -> None:
     stage = stage_of({"part": [((0.0, 0.75, 0.0), 0.25)]})
     full = final_part(stage, None, FACES).solid
     values, positions = stage.extractor.lattice_values(stage.field)
-    hollow = torch.minimum(values, (positions - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1) - 0.1)
+    hollow = values - dent(positions)
     stage.extractor.lattice_values = lambda field: (hollow, positions)
     solid = final_part(replace(stage, field=Hollow()), None, FACES).solid
     check(solid)

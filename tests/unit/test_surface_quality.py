@@ -88,6 +88,7 @@ def test_teeth_are_turns_and_notches() -> None:
     joint = measure_joint(*waved(CELL, 20), CELL)
     assert joint.curves == 1
     assert 0.8 < joint.notches.max() < 1.3
+    assert joint.sideways_notches.max() == pytest.approx(joint.notches.max(), rel=1e-3)  # the base is flat
     # A sine of amplitude A and wavelength L turns by at most 4 pi^2 A / L^2 a length.
     wavelength = 2 * np.pi * 0.4 / 20 / CELL
     steepest = np.degrees(4 * np.pi**2 / wavelength**2)

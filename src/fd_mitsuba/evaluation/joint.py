@@ -28,6 +28,7 @@ class Joint:
         turning_deg: (N,) the angle between directions one cell apart, all along the curves.
         sideways_deg: (N,) the same without what the base itself turns: the angle in the base's tangent plane.
         notches: (N,) the distance in cells of points all along the curves from the smoothed curves.
+        sideways_notches: (N,) the same without what the base itself bends: within the base's tangent plane.
     """
 
     curves: int
@@ -35,6 +36,7 @@ class Joint:
     turning_deg: np.ndarray
     sideways_deg: np.ndarray
     notches: np.ndarray
+    sideways_notches: np.ndarray
 
 
 def measure_joint(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance, cell: float) -> Joint:
@@ -43,7 +45,8 @@ def measure_joint(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance, c
     Args:
         cell: the training lattice's spacing, in the frame's unit.
     """
-    turning, sideways, notches, length = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], 0.0
+    turning, sideways, notches, flat_notches = ([np.zeros(0)] for _ in range(4))
+    length = 0.0
     curves = joint_curves(vertices, faces, base)
     for curve in curves:
         around = float(np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1).sum()) / cell
@@ -56,12 +59,14 @@ def measure_joint(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance, c
         behind = points - np.roll(points, _STEPS_A_CELL, axis=0)
         turning.append(_angles_deg(ahead, behind))
         upward = _upward(base, points, cell)
-        flat = [rows - upward * np.einsum("ij,ij->i", rows, upward)[:, None] for rows in (ahead, behind)]
-        sideways.append(_angles_deg(*flat))
         window = int(min(_NOTCH_CELLS, around / 3) * _STEPS_A_CELL) // 2 * 2 + 1
-        smooth = savgol_filter(points, window, 2, axis=0, mode="wrap")
-        notches.append(np.linalg.norm(points - smooth, axis=1) / cell)
-    return Joint(len(curves), length, *(np.concatenate(rows) for rows in (turning, sideways, notches)))
+        notch = points - savgol_filter(points, window, 2, axis=0, mode="wrap")
+        flat = [rows - upward * np.einsum("ij,ij->i", rows, upward)[:, None] for rows in (ahead, behind, notch)]
+        sideways.append(_angles_deg(flat[0], flat[1]))
+        notches.append(np.linalg.norm(notch, axis=1) / cell)
+        flat_notches.append(np.linalg.norm(flat[2], axis=1) / cell)
+    measured = (np.concatenate(rows) for rows in (turning, sideways, notches, flat_notches))
+    return Joint(len(curves), length, *measured)
 
 
 def _angles_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -14,11 +14,11 @@ A level line of `a` on the base is the joint: closed, and without a kink where t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
+from fd_mitsuba.export.final_surface.spline import LatticeSpline
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 
@@ -31,30 +31,6 @@ _SMOOTH_CELLS = 0.75
 """Standard deviation of the Gaussian. The joint lies further than this from what makes it."""
 
 
-@dataclass(frozen=True)
-class Contact:
-    """The smoothed distance on a lattice.
-
-    Attributes:
-        coefficients: (z, y, x) of a cubic spline through the values, canonical units.
-        gradient: (3, z, y, x) along x, y, z.
-        origin: (3,) canonical position of the first vertex.
-        spacing: canonical units.
-    """
-
-    coefficients: np.ndarray
-    gradient: np.ndarray
-    origin: np.ndarray
-    spacing: float
-
-    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values (N,) and gradients (N, 3) at points (N, 3), canonical; beyond the lattice as on its border."""
-        place = ((points - self.origin) / self.spacing).T[::-1]
-        value = ndimage.map_coordinates(self.coefficients, place, order=3, mode="nearest", prefilter=False)
-        slope = [ndimage.map_coordinates(axis, place, order=1, mode="nearest") for axis in self.gradient]
-        return value, np.stack(slope, axis=1)
-
-
 def contact_of(
     grid: TetGrid,
     base_lattice: np.ndarray,
@@ -62,8 +38,8 @@ def contact_of(
     base: MeshDistance,
     surface: tuple[np.ndarray, np.ndarray],
     in_part: Callable[[np.ndarray], np.ndarray],
-) -> Contact | None:
-    """The contact of a part with the base; None where they do not come near each other.
+) -> LatticeSpline | None:
+    """The smoothed distance `a` from the contact of a part with the base; None where they do not come near each other.
 
     Args:
         base_lattice: (z, y, x) base sdf at the grid's vertices.
@@ -93,8 +69,7 @@ def contact_of(
     raw.reshape(-1)[index] = np.where(in_part(points), -distance, distance)
     nearest = np.asarray(ndimage.distance_transform_edt(~marked, return_distances=False, return_indices=True))
     smooth = ndimage.gaussian_filter(raw[tuple(nearest)], _SMOOTH_CELLS * _FINER, mode="nearest")
-    gradient = np.stack([np.gradient(smooth, step, axis=axis) for axis in (2, 1, 0)])
-    return Contact(ndimage.spline_filter(smooth, 3, mode="nearest"), gradient, origin, step)
+    return LatticeSpline.through(smooth, origin, step)
 
 
 def _outside(vertices: np.ndarray, faces: np.ndarray, base: MeshDistance) -> MeshDistance | None:

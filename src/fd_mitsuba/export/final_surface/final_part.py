@@ -21,6 +21,7 @@ import torch
 
 from fd_mitsuba.export.final_surface.contact import contact_of
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
+from fd_mitsuba.export.final_surface.learned import learned_spline
 from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
 from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach
 from fd_mitsuba.export.final_surface.rim import rim_normals
@@ -117,12 +118,9 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
     extractor, grid = grown.extractor, coarse.grid
     base = None if coarse.cuts else MeshDistance(grown.base.vertices, grown.base.faces)
 
-    def sdf_part(points: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-        return grown.field.evaluate(points, region).sdf
-
     reach = fillet_reach(extractor.union_k, _FILM_CELLS * grid.spacing)
     function = PartFunction(
-        sdf_part, list(grown.parts.values()), coarse.number, grid, base, extractor.union_k,
+        learned_spline(grown), list(grown.parts.values()), coarse.number, grid, base, extractor.union_k,
         extractor.union_only_outside, reach, coarse.sink, _lattice(coarse, coarse.sdf_base), coarse.bridges,
     )  # fmt: skip
     if base is None:

@@ -1,11 +1,12 @@
 """A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
 
-    part   = min(sdf_part, region + margin, room)      where the part may be at all
+    part   = min(region + learned, region + margin, room)      where the part may be at all
     blend  = part, but -away at the base's surface and inside it, from one to the other within 0.4 k
     joined = max(sdf_base - 2 max(away - reach, 0), blend) + fillet(sdf_base, blend)
     value  = min(joined, sink - sdf_base, lead)        positive inside the solid
 
-`sdf_base` is the exact distance to triangles, `sdf_part` is the network. See `part_solid` for `joined`, `sink` and
+`sdf_base` is the exact distance to triangles, `region` that to the focal regions, and `learned` a spline through what
+the field adds to it at the vertices of the training's lattice (`learned`). See `part_solid` for `joined`, `sink` and
 `lead`. `away` is the smoothed distance to where the part is seen to stand on the base (`contact`): the curve along
 which the solid dives under the base, two down for one along, is a level line of it. The edge at `sink` is rounded.
 """
@@ -20,16 +21,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.export.final_surface.contact import Contact
 from fd_mitsuba.export.final_surface.projection import FLATTEST
+from fd_mitsuba.export.final_surface.spline import LatticeSpline
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
 from fd_mitsuba.extraction.active_vertices import DEFAULT_MARGIN
 from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-
-SdfPart = Callable[[Tensor, Tensor], Tensor]
-"""Points (N, 3) and the signed distance (N,) to the focal regions there -> `sdf_part` (N,), differentiable."""
 
 _STEP = 1e-3
 """Of the differences that a region's gradient is made of, canonical units."""
@@ -55,7 +53,7 @@ class PartFunction:
     """What a part's solid is made of.
 
     Attributes:
-        sdf_part: the part's field.
+        learned: what the part's field adds to the distance to the regions.
         parts: the regions of all named parts.
         number: the part that is meant; None: all together.
         grid: the lattice of the training; the part keeps away from its border.
@@ -70,7 +68,7 @@ class PartFunction:
         contact: how far a point is from where the part stands on the base; None: nowhere near.
     """
 
-    sdf_part: SdfPart
+    learned: LatticeSpline
     parts: Sequence[Sequence[FocalRegion]]
     number: int | None
     grid: TetGrid
@@ -82,7 +80,7 @@ class PartFunction:
     base_lattice: np.ndarray
     bridges: Sequence[Bridge] = ()
     surface: MeshDistance | None = None
-    contact: Contact | None = None
+    contact: LatticeSpline | None = None
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """The value (N,) float64 at points (N, 3), canonical."""
@@ -166,7 +164,7 @@ class PartFunction:
     def _beside_base(self, x: Tensor, part: Tensor, base: Tensor) -> Tensor:
         if self.contact is None:
             return torch.minimum(part, self.sink - base)
-        away = _attached(x, *self.contact.at(x.detach().double().numpy()))
+        away = self._spline_at(self.contact, x)
         joined = self._joined(base, part, away, _DIVE * (away - self.reach).clamp(min=0))
         return rounded_minimum(joined, self.sink - base, _ROUND_CELLS * self.grid.spacing)
 
@@ -200,7 +198,7 @@ class PartFunction:
     def _part(self, x: Tensor, swollen: bool) -> Tensor:
         region = self._region([region for regions in self.parts for region in regions], x)
         room = self.grid.half_extent - 0.5 * self.grid.spacing - x.abs().amax(dim=1)
-        part = torch.minimum(torch.minimum(self.sdf_part(x, region), region + DEFAULT_MARGIN), room)
+        part = torch.minimum(region + self._spline_at(self.learned, x).clamp(max=DEFAULT_MARGIN), room)
         near = torch.from_numpy(np.flatnonzero(self._near_base(x)))
         if not swollen or not self.bridges or not len(near):
             return part
@@ -231,6 +229,10 @@ class PartFunction:
         if surface is None:
             return torch.zeros(len(x))
         return _attached(x, *self._from(surface, x.detach().double().numpy()))
+
+    @staticmethod
+    def _spline_at(spline: LatticeSpline, x: Tensor) -> Tensor:
+        return _attached(x, *spline.at(x.detach().double().numpy()))
 
     @staticmethod
     def _from(mesh: MeshDistance, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
