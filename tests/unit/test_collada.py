@@ -129,7 +129,7 @@ def test_an_image_is_found_by_its_last_name(tmp_path: Path, picture: np.ndarray)
         (lambda text: "<!DOCTYPE a [<!ENTITY b 'c'>]>" + text, "declares a document type"),
         (lambda text: text[: len(text) // 2], "cannot be read"),
         (lambda text: text.replace("<instance_geometry", "<x").replace("</instance_geometry", "</x"), "no faces"),
-        (lambda text: "", "cannot be read"),
+        (lambda text: "", "is empty"),
         (lambda text: re.sub(r"(<float_array[^>]*places[^>]*>)[^ ]+", r"\1NaN", text), "NaN or infinite"),
         (lambda text: "\0\0" + text, "is not UTF-8"),
     ],
