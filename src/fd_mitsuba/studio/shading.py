@@ -53,7 +53,7 @@ def dressed(glb: bytes, material: PbrMaterial) -> bytes:
         )
     for mesh in file.meshes:
         for primitive in mesh.primitives:
-            primitive.attributes.COLOR_0 = None
+            primitive.attributes.COLOR_0 = None  # pyright: ignore[reportAttributeAccessIssue]
     return b"".join(file.save_to_bytes())
 
 
