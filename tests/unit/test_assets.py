@@ -495,3 +495,18 @@ def test_what_was_imported_is_exported_without_a_fault(returned: Callable[..., P
 def test_the_assets_themselves_are_sound() -> None:
     faults = glb_faults(*(ASSETS / name for name in NAMES if name.endswith("lb") or name == "embedded.gltf"))
     assert not any(report["errors"] for report in faults.values())
+
+
+def test_a_byte_order_mark_hides_no_line(tmp_path: Path) -> None:
+    """Editors of Windows put one before the first line, which names the materials, or holds the first vertex."""
+    mark, plain = b"\xef\xbb\xbf", (ASSETS / "star.obj").read_bytes()
+    vertex = plain[plain.index(b"\nv ") + 1 :]
+    (tmp_path / "plain.obj").write_bytes(vertex)
+    (tmp_path / "marked.obj").write_bytes(mark + vertex.replace(b"\n", b"\r\n"))
+    before, after = (read_asset(tmp_path / name).meshes for name in ("plain.obj", "marked.obj"))
+    for one, other in zip(before, after, strict=True):
+        assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
+    (tmp_path / "red.mtl").write_bytes(mark + b"newmtl red\r\nKd 1 0 0\r\n")
+    (tmp_path / "red.obj").write_bytes(mark + b"mtllib red.mtl\r\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n")
+    asset = read_asset(tmp_path / "red.obj")
+    assert asset.materials[asset.meshes[0].material].base_color == pytest.approx((1, 0, 0)) and not asset.notes

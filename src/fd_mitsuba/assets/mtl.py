@@ -24,7 +24,7 @@ def read_mtl(path: Path, notes: list[str]) -> dict[str, AssetMaterial]:
     Colours are taken as they are, linear; the classic shininess `Ns` becomes a roughness where `Pr` does not give one.
     """
     try:
-        text = read_regular(path, _MOST_BYTES).decode("utf-8", errors="replace")
+        text = read_regular(path, _MOST_BYTES).decode("utf-8-sig", errors="replace")
     except NotReadable as error:
         notes.append(f"its material file {path.name!r} {error}, so that the mesh is grey; keep it beside the OBJ")
         return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ class _Text:
         self.skipped = 0
         current = -1
         rows = {b"v": self.vertices, b"vt": self.uvs, b"vn": self.normals}
-        for line in data.splitlines():
+        for line in data.removeprefix(BOM_UTF8).splitlines():
             words = line.split()
             if not words:
                 continue
