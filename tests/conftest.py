@@ -51,7 +51,7 @@ def _no_scenes_of_other_files() -> None:
 
 
 @pytest.fixture
-def one_thread(mi: Any) -> Iterator[None]:
+def one_thread(mi: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Sums are added up in one order, so that the same seed gives the same bytes.
 
     More threads round differently, and Adam makes whole steps of gradients that are nothing but rounding.
@@ -59,6 +59,8 @@ def one_thread(mi: Any) -> Iterator[None]:
     import drjit as dr
     import torch
 
+    # What an earlier test in this process, as one of the Python API, has shared out for good.
+    monkeypatch.setattr("fd_mitsuba.backend.threads._cores", 1)
     before = dr.thread_count(), torch.get_num_threads()
     dr.set_thread_count(1)
     torch.set_num_threads(1)
