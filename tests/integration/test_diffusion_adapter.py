@@ -593,6 +593,15 @@ def test_too_little_memory_is_told_before_loading(folders: dict[str, Path], monk
         DiffusionGuidance.load(GuidanceConfig(model=str(folders["sd15"])))
 
 
+def test_a_renderer_on_the_same_card_is_left_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available_bytes", lambda _: 8_000_000_000)
+    monkeypatch.setattr(memory, "renders_on_card", lambda: True)
+    memory.require_memory(4_000_000_000, 3_500_000_000, "cpu", "model")
+    memory.require_memory(4_000_000_000, 2_900_000_000, "cuda", "model")
+    with pytest.raises(UserError, match="4.50 GB to work in"):
+        memory.require_memory(4_000_000_000, 3_500_000_000, "cuda", "model")
+
+
 def test_memory_estimate_of_stable_diffusion() -> None:
     """Measured with SD 1.5 at 512 x 512: 3.35 GB for a picture to the latents and back, 0.26 GB through the UNet."""
     unet, vae = {"block_out_channels": (320, 640, 1280, 1280)}, {"block_out_channels": (128, 256, 512, 512)}

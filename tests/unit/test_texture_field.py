@@ -130,6 +130,14 @@ def test_learns_a_colour_and_a_normal_that_vary_in_space():
     assert math.sqrt(loss.item()) < 0.05
 
 
+def test_a_moved_field_computes_where_its_weights_are():
+    """`meta` stands for a card: tensors there have no values, so that the way back is what fails."""
+    moved = TextureField(SMALL).to("meta")
+    assert {value.device.type for value in vars(moved(points().to("meta"))).values()} == {"meta"}
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta"):
+        moved(points())
+
+
 def test_the_seed_decides_and_the_global_state_is_left_alone():
     before = torch.random.get_rng_state()
     first, again, other = (TextureField(SMALL, seed).state_dict() for seed in (1, 1, 2))

@@ -73,7 +73,7 @@ class GuidanceConfig(Section):
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Precision of the UNet; the VAE stays in float32."""
     device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d{1,3})?)$"), MAY_CHANGE] = "cpu"
-    """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`. Rendering stays on the CPU."""
+    """Where the networks run: `cpu`, `cuda`, `cuda:1`, `mps`; on `cuda` the texture field, too."""
     view_prompts: bool = True
     """Add words for the view's direction to the prompt."""
 

@@ -16,9 +16,10 @@ from fd_mitsuba.fields.hash_grid import HashGrid
 def features_at(grid: HashGrid, points: Float[Tensor, "N 3"]) -> Float[Tensor, "features N"]:
     """The features (levels * features, N) at canonical points (N, 3), columns as `ColumnMlp` reads them.
 
-    Points beyond the grid's cube count as its border. Gradients flow to the table, not to the points.
+    Points beyond the grid's cube count as its border. Gradients flow to the table, not to the points. The features are
+    where the table is.
     """
-    return _Features.apply(grid.table, points.detach().to(grid.table.dtype), grid)
+    return _Features.apply(grid.table, points.detach().to(grid.table.device, grid.table.dtype), grid)
 
 
 class _Features(torch.autograd.Function):

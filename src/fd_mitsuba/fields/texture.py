@@ -48,6 +48,8 @@ class TextureValues:
 class TextureField(nn.Module):
     """The network of the part's material. Its `state_dict` holds the learned weights and is all a checkpoint needs.
 
+    It may be moved to a card: points go there, and what it says comes back to where they are, gradients the other way.
+
     Args:
         config: sizes of the network and the ranges of what it says.
         seed: decides the initial weights.
@@ -56,6 +58,11 @@ class TextureField(nn.Module):
         learned: the channels that are learned. The others are exactly `start`, whatever the ranges, without gradient.
         half_extent: the field lives in [-half_extent, half_extent]^3 of the canonical frame.
     """
+
+    _low: Tensor
+    _span: Tensor
+    _offset: Tensor
+    _fixed: Tensor
 
     def __init__(
         self,
@@ -83,10 +90,10 @@ class TextureField(nn.Module):
         self.mlp = ColumnMlp(self.grid.width, config.hidden, 7, seed + 1)
         ranges = [config.base_color_range] * 3 + [config.roughness_range, config.metallic_range]
         fixed = [*start.base_color, start.roughness, start.metallic]
-        self._low = torch.tensor([low for low, _ in ranges])[:, None]
-        self._span = torch.tensor([high - low for low, high in ranges])[:, None]
-        self._offset = torch.tensor([_logit(*pair) for pair in zip(fixed, ranges, strict=True)])[:, None]
-        self._fixed = torch.tensor(fixed)[:, None]
+        self._constant("_low", [low for low, _ in ranges])
+        self._constant("_span", [high - low for low, high in ranges])
+        self._constant("_offset", [_logit(*pair) for pair in zip(fixed, ranges, strict=True)])
+        self._constant("_fixed", fixed)
         self._steepest = math.tan(math.radians(config.max_tilt_deg))
 
     def forward(self, points: Float[Tensor, "N 3"]) -> TextureValues:
@@ -99,7 +106,12 @@ class TextureField(nn.Module):
             (scalars if channel in self.learned else constant)[where].t()
             for channel, where in (("base_color", slice(3)), ("roughness", slice(3, 4)), ("metallic", slice(4, 5)))
         )
-        return TextureValues(color, roughness, metallic, self._normal(rows[5:]))
+        values = color, roughness, metallic, self._normal(rows[5:])
+        return TextureValues(*(value.to(points.device) for value in values))
+
+    def _constant(self, name: str, column: list[float]) -> None:
+        """A column that goes with the field to a card, and into no checkpoint."""
+        self.register_buffer(name, torch.tensor(column)[:, None], persistent=False)
 
     def _normal(self, rows: Tensor) -> Tensor:
         if "normal" not in self.learned:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from fd_mitsuba.backend.processes import processes
+from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
 
 
@@ -14,6 +15,15 @@ def own_device(name: str) -> str:
     if name != "cuda" or group.local_count == 1:
         return name
     return f"cuda:{group.local_rank % max(torch.cuda.device_count(), 1)}"
+
+
+def field_device(config: GuidanceConfig) -> torch.device:
+    """Where the texture field is evaluated: on the card that the guidance's networks are on, else on the CPU.
+
+    The part's sdf stays on the CPU, where the surface is extracted from it.
+    """
+    device = torch.device(own_device(config.device))
+    return device if device.type == "cuda" else torch.device("cpu")
 
 
 def require_device(name: str, setting: str = "guidance.device") -> torch.device:

@@ -21,6 +21,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
 from fd_mitsuba.guidance.colour_latents import shine
+from fd_mitsuba.guidance.device import field_device
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
 from fd_mitsuba.render.appearance_pass import AppearancePass, AppearancePictures
 from fd_mitsuba.render.appearance_scene import Triangles
@@ -84,6 +85,8 @@ class AppearanceStage:
         say(self.material.message)
         seed = seed_for(config.seed, Purpose.TEXTURE)
         self.field = TextureField(config.texture, seed, self.material.start, self.material.learned)
+        if guidance is not None:
+            self.field.to(field_device(config.guidance))
         self.optimiser = adamw(self.field, settings)
         size = settings.picture_size or (guidance.appearance_size if guidance is not None else 128)
         self.shading = PartShading.of(self.material)
