@@ -1,6 +1,7 @@
 """What `check` announces against what a run takes: `python benchmarks/forecast.py [--json] [--only NAME ...]`.
 
-The cat with `configs/quick.toml`, as it is and with one input that is far larger. Each run is a process of its own.
+The cat with `configs/quick.toml`, as it is and with one input that is far larger, and three steps with a network as
+wide as Stable Diffusion 1.5's. Each run is a process of its own.
 
     announced_mb, peak_mb  most memory: as announced, and the largest resident set of the run's process
     announced_s, seconds   wall time of the whole command, likewise; says something only on a machine with nothing else
@@ -27,6 +28,7 @@ import numpy as np  # noqa: E402
 import trimesh  # noqa: E402
 from machine import machine  # noqa: E402
 from PIL import Image  # noqa: E402
+from wide_network import save_wide_network  # noqa: E402
 
 SCENE = ROOT / "scenes" / "cat" / "scene.xml"
 
@@ -91,6 +93,14 @@ def fine_grid(folder: Path) -> list[str]:
     return [str(SCENE), "--set", "geometry.grid_resolution=128"]
 
 
+def wide_network(folder: Path) -> list[str]:
+    """Random weights of Stable Diffusion 1.5's widths, one view at a time: a step of each phase and one of material."""
+    model = save_wide_network(folder / "model")
+    steps = ("geometry.steps=2", "geometry.coarse_fraction=0.5", "geometry.views=1")
+    steps += ("appearance.steps=1", "appearance.views=1", "guidance.views_per_call=1", f"guidance.model={model}")
+    return [str(SCENE), "-c", "paper", *(word for step in steps for word in ("--set", step))]
+
+
 def _text() -> str:
     """The scene file, to be put in another folder."""
     return SCENE.read_text().replace("../lighting", str(SCENE.parent.parent / "lighting"))
@@ -113,6 +123,7 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
         large_textures,
         large_bake,
         fine_grid,
+        wide_network,
     )
 }
 
@@ -121,7 +132,7 @@ def measured(make: Callable[[Path], list[str]], threads: int) -> dict[str, Any]:
     """One case, forecast and run."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        words = [*make(folder), "-c", "quick", "-t", str(threads)]
+        words = ["-c", "quick", "-t", str(threads), *make(folder)]  # of two settings the last counts
         python = [sys.executable, "-m", "fd_mitsuba"]
         environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
         check = subprocess.run([*python, "check", *words, "--json"], capture_output=True, text=True, env=environment)

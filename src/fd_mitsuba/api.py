@@ -26,6 +26,7 @@ from fd_mitsuba.config.registry import load_plugins
 from fd_mitsuba.conventions import STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.runs.run import Run
+from fd_mitsuba.scene.prompt_text import length_fault, one_line_of
 
 if TYPE_CHECKING:
     from fd_mitsuba.assets.importing import ImportedAsset
@@ -130,9 +131,11 @@ def load_scene(
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
     """
-    words = None if prompt is None else " ".join(prompt.split())
+    words = None if prompt is None else one_line_of(prompt)
     if words == "":
         raise UserError("prompt: is blank; describe the edited object")
+    if words is not None and (fault := length_fault(words)):
+        raise UserError(f"prompt: {fault}")
     if threads < 0:
         raise UserError(f"threads = {threads}: give 0 (all cores) or a positive number")
     with own_threads(threads, variant):

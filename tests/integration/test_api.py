@@ -105,6 +105,8 @@ def test_what_is_not_there_is_named(edited: tuple[fd.Run, Darker, list], tmp_pat
         fd.Run.open(tmp_path)
     with pytest.raises(fd.UserError, match="is blank"):
         fd.load_scene(SCENE, prompt="  ")
+    with pytest.raises(fd.UserError, match="prompt: has 3002 characters; describe"):
+        fd.load_scene(SCENE, prompt="a cat with " + "a crown " * 374)
     with pytest.raises(fd.UserError, match="stages = .'texture'.: give any of geometry, appearance"):
         fd.edit(fd.load_scene(SCENE), fd.Config.load("smoke"), output=tmp_path / "run", stages=["texture"])
 

@@ -45,6 +45,7 @@ CASES: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
     "prompt missing": ({"integrator": '<integrator type="dual_path"/>'}, ("dual_path", "prompt", "add")),
     "prompt empty": ({"integrator": dual_path("")}, ("prompt", "add")),
     "prompt blank": ({"integrator": dual_path("  &#9; ")}, ("prompt", "add")),
+    "prompt far too long": ({"integrator": dual_path("crown " * 17000)}, ("prompt has 101999 characters", "at most")),
     "prompt not text": (
         {"integrator": '<integrator type="dual_path"><float name="prompt" value="3"/></integrator>'},
         ("prompt", "not text"),
@@ -58,6 +59,10 @@ CASES: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
     "region prompt blank": (
         {"region": region(NEAR, '<string name="prompt" value=" "/>')},
         ("wing", "prompt is blank", "remove it"),
+    ),
+    "region prompt far too long": (
+        {"region": region(NEAR, f'<string name="prompt" value="{"wing " * 500}"/>')},
+        ("wing", "prompt has 2499 characters", "at most"),
     ),
     "region prompt not text": (
         {"region": region(NEAR, '<float name="prompt" value="2"/>')},

@@ -87,7 +87,8 @@ def test_a_run_on_the_card_ends_as_one_on_the_cpu(tmp_path: Path) -> None:
     volumes = {}
     for name, given in options.items():
         out = tmp_path / name
-        command = [sys.executable, "-m", "fd_mitsuba", "run", "scenes/cat/scene.xml", "-c", "smoke", "-o", str(out), *given]
+        words = ["run", "scenes/cat/scene.xml", "-c", "smoke", "-o", str(out), *given]
+        command = [sys.executable, "-m", "fd_mitsuba", *words]
         result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280)
         assert result.returncode == 0, result.stderr
         volumes[name] = json.loads((out / "metrics.json").read_text())["part_volume"]

@@ -116,7 +116,7 @@ def test_a_prompt_is_that_of_a_part() -> None:
     assert regions.poses[image.name].prompt == "a hat"
     regions.put(replace(regions.poses["crest"], prompt=""))
     assert not any(pose.prompt for pose in regions.poses.values())
-    with pytest.raises(UserError, match="1001 letters"):
+    with pytest.raises(UserError, match="1001 characters"):
         regions.put(replace(regions.poses["crest"], prompt="x" * 1001))
     vertices, faces = unit_sphere(1)
     ball = FocalRegion("ball", np.eye(4), "hat", TriangleMesh("ball", vertices, faces), prompt=PartPrompt("a cap"))

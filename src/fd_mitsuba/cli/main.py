@@ -35,6 +35,7 @@ from fd_mitsuba.cli.report import add_report_commands
 from fd_mitsuba.cli.run import add_run_command
 from fd_mitsuba.cli.studio import add_studio_command
 from fd_mitsuba.errors import Interrupted, UserError, out_of_memory, printable
+from fd_mitsuba.io.safe_text import is_text
 
 _LONGEST_USAGE = 300
 
@@ -43,6 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code; user errors become one line on stderr."""
     own_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
+    if own_process:
+        _open_standard_streams()
     options = command_parser().parse_args(arguments)
     if own_process:
         _exit_on_signals(options)
@@ -52,6 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.command_line = shlex.join(["fd_mitsuba", *arguments])
     verbose = getattr(options, "verbose", False)
     try:
+        _require_text(arguments)
         code = options.call(options)
         if own_process and getattr(options, "writes_nothing", False):
             _leave(code)
@@ -88,8 +92,28 @@ def main(arguments: list[str] | None = None) -> int:
 def _leave(code: int) -> None:
     """End the process at once: taking torch and Mitsuba down in order takes half a second, and nothing waits for it."""
     for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+        if stream is not None:  # as it is for a process that was started with it closed
+            stream.flush()
     os._exit(code)
+
+
+def _open_standard_streams() -> None:
+    """What was started without one of the three streams must not take the next file that it opens for it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+
+
+def _require_text(arguments: list[str]) -> None:
+    """UserError for an argument that holds bytes which are no text: Mitsuba takes no such file names."""
+    for argument in arguments:
+        if not is_text(argument):
+            raise UserError(
+                f"{ascii(argument)}: is not UTF-8 text; rename the file or folder, or set a UTF-8 locale, as by "
+                "LC_ALL=C.UTF-8"
+            )
 
 
 def _exit_on_signals(options: argparse.Namespace) -> None:

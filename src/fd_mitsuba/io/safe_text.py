@@ -14,6 +14,15 @@ _LONGEST = 100
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 
 
+def is_text(name: str) -> bool:
+    """Whether a name from the system is text in UTF-8: Python marks bytes that are not with surrogates.
+
+    >>> is_text("schneemann/hut.ply"), is_text("h\\udcfct.ply")
+    (True, False)
+    """
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
 def safe_name(text: str, taken: Collection[str] = (), suffix: str = "") -> str:
     """A name of letters, digits, `_`, `.` and `-` for a file, a group or a material, close to `text`.
 

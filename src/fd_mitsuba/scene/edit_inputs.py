@@ -9,6 +9,7 @@ from fd_mitsuba.conventions import DEFAULT_PART_NAME
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.part_stack import UNITS, read_stack
 from fd_mitsuba.scene.plugins import DUAL_PATH, FOCAL_REGION
+from fd_mitsuba.scene.prompt_text import length_fault, one_line_of
 from fd_mitsuba.scene.scene_file import SceneElement, SceneFile
 from fd_mitsuba.scene.xml_guard import scan_scene, uses
 
@@ -151,7 +152,9 @@ class EditInputs:
             value = integrators[0].properties.get(name, "")
             if not isinstance(value, str):
                 raise integrators[0].error(f'{name} is not text; write <string name="{name}" value="..."/>')
-            values.append(" ".join(value.split()))
+            values.append(one_line_of(value))
+            if fault := length_fault(values[-1]):
+                raise integrators[0].error(f"{name} {fault}")
         values[0] = prompt or values[0]
         if not values[0]:
             example = 'add <string name="prompt" value="a horse with wings"/>, or give --prompt'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fd_mitsuba.scene.focal_region import FocalRegion, PartPrompt
+from fd_mitsuba.scene.prompt_text import length_fault, one_line_of
 from fd_mitsuba.scene.scene_file import SceneElement
 
 PROMPT, NEGATIVE = "prompt", "negative_prompt"
@@ -12,13 +13,15 @@ def region_prompt(element: SceneElement) -> PartPrompt | None:
     """The region's `prompt` and `negative_prompt`; None where it has neither.
 
     Raises:
-        UserError: one of them is blank, or there is a negative prompt alone.
+        UserError: one of them is blank or far too long, or there is a negative prompt alone.
     """
     given = {name: element.properties[name] for name in (PROMPT, NEGATIVE) if name in element.properties}
-    texts = {name: " ".join(str(value).split()) for name, value in given.items()}
+    texts = {name: one_line_of(str(value)) for name, value in given.items()}
     for name, text in texts.items():
         if not text:
             raise element.error(f"{name} is blank; write what the part is to be, or remove it")
+        if fault := length_fault(text):
+            raise element.error(f"{name} {fault}")
     if not texts:
         return None
     if PROMPT not in texts:

@@ -17,6 +17,7 @@ from fd_mitsuba.backend import startup
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.backend.parser_message import MITSUBA_ERRORS, one_line
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.io.safe_text import is_text
 from fd_mitsuba.scene.centred import move_nodes, restore_digits
 from fd_mitsuba.scene.file_faults import fault_of_file
 from fd_mitsuba.scene.file_gate import check_meshes, opened_files, refuse_incomplete
@@ -95,6 +96,10 @@ class SceneFile:
 
     def __init__(self, path: Path | str, parameters: dict[str, str] | None = None) -> None:
         self.path = Path(path)
+        if not is_text(str(self.path.resolve())):
+            raise UserError(
+                f"{ascii(str(self.path.resolve()))}: Mitsuba reads no path that is not UTF-8 text; rename the folder"
+            )
         self.parameters = dict(parameters or {})
         self.warnings: tuple[str, ...] = ()
         self._copied = copied_files(self.path)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.prompt_text import length_fault, one_line_of
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.history import History, Snapshot
 from fd_mitsuba.studio.picking import first_hit
-from fd_mitsuba.studio.region_list import LONGEST_PROMPT, RegionList
+from fd_mitsuba.studio.region_list import RegionList
 
 if TYPE_CHECKING:
     from fd_mitsuba.studio.edit_state import EditState
@@ -114,9 +115,9 @@ class Edits:
 
     def set_prompt(self, prompt: str) -> None:
         """The sentence for the next run; blank: none can be started. UserError where it is far too long."""
-        words = " ".join(prompt.split())
-        if len(words) > LONGEST_PROMPT:
-            raise UserError(f"the prompt has {len(words)} letters; at most {LONGEST_PROMPT} are possible")
+        words = one_line_of(prompt)
+        if fault := length_fault(words):
+            raise UserError(f"the prompt {fault}")
         with self._lock:
             if words == self._state.prompt:
                 return

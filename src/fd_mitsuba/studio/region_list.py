@@ -13,6 +13,7 @@ from fd_mitsuba.scene.focal_region import FocalRegion, PartPrompt
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_names import is_part_name
 from fd_mitsuba.scene.part_stack import free_name
+from fd_mitsuba.scene.prompt_text import length_fault
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose, turned_to, vector
 from fd_mitsuba.studio.picking import Hit
 
@@ -21,8 +22,6 @@ NEW_RADIUS = 0.22
 _SUNK = 0.25
 """How deep a new region reaches into the base, in radii."""
 _MOST_REGIONS = 32
-LONGEST_PROMPT = 1000
-"""In letters."""
 
 
 @dataclass
@@ -96,9 +95,8 @@ class RegionList:
 
     def _share_prompt(self, pose: EllipsoidPose, before: EllipsoidPose) -> None:
         """Put a region, with the prompt that its part has: the one that was just typed, else that of the others."""
-        if len(pose.prompt) > LONGEST_PROMPT:
-            count = len(pose.prompt)
-            raise UserError(f"region {pose.name}: its prompt has {count} letters, more than {LONGEST_PROMPT}")
+        if fault := length_fault(pose.prompt):
+            raise UserError(f"region {pose.name}: its prompt {fault}")
         others = [other for other in self.poses.values() if other.part == pose.part and other.name != pose.name]
         theirs = next((other for other in others if other.prompt), None)
         if pose.part != before.part and pose.prompt == before.prompt and theirs is not None:
