@@ -1,10 +1,8 @@
 // node screenshot_glb.mjs FILE.glb PICTURE.png [ORBIT]: the file as <model-viewer> shows it in headless Chromium.
 // Prints the viewer's own account of the file as JSON: materials, and its dimensions in metres.
-import { createServer } from "node:http";
-import { mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
-import { tmpdir } from "node:os";
+import { readFile, writeFile } from "node:fs/promises";
 import { join } from "node:path";
-import { chromium } from "playwright-core";
+import { withBrowser, withServer } from "./browser.mjs";
 
 const [model, picture, orbit = "30deg 75deg auto"] = process.argv.slice(2);
 const here = new URL(".", import.meta.url).pathname;
@@ -18,25 +16,13 @@ const answers = {
   "/favicon.ico": ["image/x-icon", async () => ""],
   "/model.glb": ["model/gltf-binary", () => readFile(model)],
 };
-const server = createServer(async (request, response) => {
-  const answer = answers[request.url];
-  if (!answer) return response.writeHead(404).end();
-  response.writeHead(200, { "content-type": answer[0] }).end(await answer[1]());
-});
-await new Promise((done) => server.listen(0, "127.0.0.1", done));
-const profile = await mkdtemp(join(tmpdir(), "viewer-"));
-const quiet = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic", "--no-first-run"];
-const browser = await chromium.launchPersistentContext(profile, {
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  headless: true,
-  viewport: { width: 480, height: 480 },
-  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", ...quiet],
-});
-try {
+const answer = async (path) => answers[path] && [answers[path][0], await answers[path][1]()];
+const viewport = { width: 480, height: 480 };
+await withServer(answer, (url) => withBrowser({ viewport }, async (browser) => {
   const page = await browser.newPage();
   const problems = [];
   page.on("console", (message) => ["error", "warning"].includes(message.type()) && problems.push(message.text()));
-  await page.goto(`http://127.0.0.1:${server.address().port}/`);
+  await page.goto(url);
   await page.waitForFunction(() => document.querySelector("model-viewer")?.loaded, null, { timeout: 150000 });
   await page.waitForTimeout(3000);
   const found = await page.evaluate(() => {
@@ -48,8 +34,4 @@ try {
   });
   await writeFile(picture, Buffer.from(found.picture.split(",")[1], "base64"));
   console.log(JSON.stringify({ dimensions: found.dimensions, materials: found.materials, problems }));
-} finally {
-  await browser.close();
-  server.close();
-  await rm(profile, { recursive: true, force: true });
-}
+}));

@@ -1,24 +1,12 @@
 // node screenshot_page.mjs FILE.html PICTURE.png [WIDTH] [light|dark]: a page opened from file:// in headless Chromium.
 // Prints as JSON: console errors and warnings, requests that left the page, and what the page's own parts are doing.
-import { mkdtemp, rm } from "node:fs/promises";
-import { tmpdir } from "node:os";
-import { join, resolve } from "node:path";
+import { resolve } from "node:path";
 import { pathToFileURL } from "node:url";
-import { chromium } from "playwright-core";
+import { withBrowser } from "./browser.mjs";
 
 const [file, picture, width = "1280", scheme = "light"] = process.argv.slice(2);
-const profile = await mkdtemp(join(tmpdir(), "page-"));
-const quiet = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic", "--no-first-run"];
-const browser = await chromium.launchPersistentContext(profile, {
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  headless: true,
-  viewport: { width: Number(width), height: 900 },
-  colorScheme: scheme,
-  reducedMotion: "reduce",
-  timeout: 180000,
-  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", ...quiet],
-});
-try {
+const viewport = { width: Number(width), height: 900 };
+await withBrowser({ viewport, colorScheme: scheme, reducedMotion: "reduce" }, async (browser) => {
   const page = await browser.newPage();
   const problems = [], requests = [];
   // Software rendering is slow to read pixels back and says so; that is about this machine and not about the page.
@@ -64,7 +52,4 @@ try {
   if (has_model) await page.waitForTimeout(2500);
   await page.screenshot({ path: picture, fullPage: true, timeout: 240000 });
   console.log(JSON.stringify({ problems, requests: requests.slice(1), ...found }));
-} finally {
-  await browser.close();
-  await rm(profile, { recursive: true, force: true });
-}
+});

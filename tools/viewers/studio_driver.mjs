@@ -1,31 +1,12 @@
 // What a person does with the page of `fd_mitsuba studio`, in headless Chromium.
-import { mkdtemp, rm } from "node:fs/promises";
-import { tmpdir } from "node:os";
-import { join } from "node:path";
-import { chromium } from "playwright-core";
+import { withBrowser } from "./browser.mjs";
 
-const QUIET = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic", "--no-first-run"];
-const SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
-
-// Calls `drive(browser)` with a browser of its own, which is gone afterwards.
-export async function withBrowser(options, drive) {
-  const profile = await mkdtemp(join(tmpdir(), "page-"));
-  const browser = await chromium.launchPersistentContext(profile, {
-    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-    headless: true,
-    viewport: { width: options.width ?? 1280, height: options.height ?? 860 },
-    acceptDownloads: true,
-    timeout: 180000,
-    args: [...SOFTWARE_GL, ...QUIET],
+// Calls `drive(browser)` with a browser of the size that `options` may have.
+export const withStudioBrowser = ({ width = 1280, height = 860 }, drive) =>
+  withBrowser({ viewport: { width, height }, acceptDownloads: true }, (browser) => {
+    browser.setDefaultTimeout(120000);
+    return drive(browser);
   });
-  browser.setDefaultTimeout(120000);
-  try {
-    return await drive(browser);
-  } finally {
-    await browser.close();
-    await rm(profile, { recursive: true, force: true });
-  }
-}
 
 export async function screenshot(page, path) {
   const notice = page.locator(".mantine-Notification-root", { hasText: "Software WebGL" });

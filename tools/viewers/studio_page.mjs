@@ -2,7 +2,7 @@
 // grow: drags the gizmo, types a prompt, grows, leaves as soon as the part is to be seen. resume: goes on, downloads.
 // picture: waits, and takes a picture. Prints as JSON what it saw; pictures and downloads go into FOLDER.
 import { join } from "node:path";
-import { choose, download, drag, open, screenshot, text, type, upload, value, withBrowser } from "./studio_driver.mjs";
+import { choose, download, drag, open, screenshot, text, type, upload, value, withStudioBrowser } from "./studio_driver.mjs";
 
 const [action, url, folder, given = "{}"] = process.argv.slice(2);
 const options = JSON.parse(given);
@@ -72,7 +72,7 @@ async function look(browser, page) {
   said.text = await text(page);
 }
 
-await withBrowser(options, async (browser) => {
+await withStudioBrowser(options, async (browser) => {
   const started = Date.now();
   const page = await tab(browser);
   said.interactive_seconds = (Date.now() - started) / 1000;

@@ -2,7 +2,7 @@
 // FOLDER. JSON: mesh to open, prompt, drag of the gizmo [[x, y], [x, y]]. Prints as JSON for each picture: its file, for
 // how many milliseconds to show it, and the words for what is done in it.
 import { join } from "node:path";
-import { drag, field, open, screenshot, text, upload, withBrowser } from "./studio_driver.mjs";
+import { drag, field, open, screenshot, text, upload, withStudioBrowser } from "./studio_driver.mjs";
 
 const [url, folder, given] = process.argv.slice(2);
 const options = JSON.parse(given);
@@ -53,7 +53,7 @@ async function watch(page, pattern, until, every, milliseconds) {
   }
 }
 
-await withBrowser(options, async (browser) => {
+await withStudioBrowser(options, async (browser) => {
   const page = await browser.newPage();
   await page.goto(url, { timeout: 150000 });
   await page.getByText("told to the prior").waitFor();

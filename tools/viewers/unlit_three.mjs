@@ -1,11 +1,9 @@
 // node unlit_three.mjs FOLDER OUT JSON: mesh files of a folder as three.js shows them in headless Chromium, unlit.
 // JSON: a list of {"name": "box.glb", "eye": [x, y, z], "target": [x, y, z], "fov": degrees, "size": pixels}, and for a
 // PLY "map", the image that it names. OUT gets a PNG for each, transparent where nothing is. Prints problems as JSON.
-import { createServer } from "node:http";
-import { mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
-import { tmpdir } from "node:os";
+import { readFile, writeFile } from "node:fs/promises";
 import { extname, join, normalize } from "node:path";
-import { chromium } from "playwright-core";
+import { withBrowser, withServer } from "./browser.mjs";
 
 const [folder, out, given] = process.argv.slice(2);
 const three = new URL("node_modules/three/", import.meta.url).pathname;
@@ -73,39 +71,23 @@ window.shot = async (job) => {
 window.ready = true;
 </script>`;
 
-const server = createServer(async (request, response) => {
-  const path = normalize(decodeURIComponent(new URL(request.url, "http://page").pathname));
-  try {
-    const data = path === "/" ? page_text
-      : path.startsWith("/three/") ? await readFile(join(three, path.slice(7)))
-      : path.startsWith("/files/") ? await readFile(join(folder, path.split(/[\\/]/).at(-1)))
-      : "";
-    response.writeHead(200, { "content-type": kinds[extname(path) || ".html"] ?? "application/octet-stream" }).end(data);
-  } catch {
-    response.writeHead(404).end();
-  }
-});
-await new Promise((done) => server.listen(0, "127.0.0.1", done));
-const profile = await mkdtemp(join(tmpdir(), "viewer-"));
-const quiet = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic", "--no-first-run"];
-const browser = await chromium.launchPersistentContext(profile, {
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  headless: true,
-  timeout: 180000,
-  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", ...quiet],
-});
-try {
+async function answer(path) {
+  const asked = normalize(path);
+  const data = asked === "/" ? page_text
+    : asked.startsWith("/three/") ? await readFile(join(three, asked.slice(7)))
+    : asked.startsWith("/files/") ? await readFile(join(folder, asked.split(/[\\/]/).at(-1)))
+    : "";
+  return [kinds[extname(asked) || ".html"] ?? "application/octet-stream", data];
+}
+
+await withServer(answer, (url) => withBrowser({}, async (browser) => {
   const page = await browser.newPage(), problems = [];
   page.on("pageerror", (error) => problems.push(String(error)));
-  await page.goto(`http://127.0.0.1:${server.address().port}/`);
+  await page.goto(url);
   await page.waitForFunction(() => window.ready, null, { timeout: 150000 });
   for (const job of JSON.parse(given)) {
     const picture = await page.evaluate((job) => window.shot(job), job);
     await writeFile(join(out, `${job.name}.png`), Buffer.from(picture.split(",")[1], "base64"));
   }
   console.log(JSON.stringify(problems));
-} finally {
-  await browser.close();
-  server.close();
-  await rm(profile, { recursive: true, force: true });
-}
+}));
