@@ -31,6 +31,8 @@ _PLACE = re.compile(
 _WHOLE_FILE = re.compile(
     r": (the file is empty|(is a|is not a|is no|no such|not a|not an|cannot be read|not found|has|is larger than)\b)"
 )
+_ASSET = re.compile(r"\.(3ds|dae|glb|gltf|obj|off|ply|stl|zip): [^;]+; \w")
+"""Files without lines: what is wrong and what to do, after the file's name."""
 _LIBRARIES = ("Corrupt JPEG data", "Premature end of JPEG file", "Warning: unknown JFIF")
 """Lines that a decoder writes to stderr itself."""
 ALLOWED = (WORKS, REFUSED, USAGE)
@@ -78,7 +80,7 @@ class Outcome:
     @property
     def is_precise(self) -> bool:
         """Whether a refusal names an option, a setting, or a file and what in it, if not the file as a whole."""
-        return self.kind == USAGE or any(pattern.search(self.message) for pattern in (_PLACE, _WHOLE_FILE))
+        return self.kind == USAGE or any(pattern.search(self.message) for pattern in (_PLACE, _WHOLE_FILE, _ASSET))
 
 
 class Forked:
@@ -127,6 +129,7 @@ def _serve() -> None:
     import drjit  # noqa: F401
     import mitsuba  # noqa: F401
 
+    import fd_mitsuba.assets.importing  # noqa: F401
     import fd_mitsuba.backend.threads  # noqa: F401
     import fd_mitsuba.cli.main  # noqa: F401
     import fd_mitsuba.evaluation.report.run_page  # noqa: F401

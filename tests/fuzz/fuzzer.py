@@ -20,12 +20,14 @@ from random import Random
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2] / "src")]
 
+from fuzz.asset_files import assets
 from fuzz.forked import ALLOWED, HANG, OTHER, REFUSED, SIGNAL, TRACEBACK, USAGE, WORKS, Forked, Outcome
 from fuzz.mutators import KINDS, LONG_KINDS, Mutator
 from fuzz.run_folders import run_folder
 from fuzz.seeds import small_exr, write_seeds
 
 RUN_FOLDERS = "run folders"
+ASSETS = "assets"
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class Fuzzer:
 
     def __init__(self, seed: int, with_run: bool = False, keep: Path | None = None) -> None:
         self.seed, self.with_run, self.keep = seed, with_run, keep
-        self.kinds: dict[str, Mutator] = KINDS | LONG_KINDS | ({RUN_FOLDERS: run_folder} if with_run else {})
+        more: dict[str, Mutator] = {ASSETS: assets}
+        self.kinds = KINDS | LONG_KINDS | more | ({RUN_FOLDERS: run_folder} if with_run else {})
 
     def __enter__(self) -> Fuzzer:
         self._place = tempfile.TemporaryDirectory(prefix="fuzz-")
@@ -161,7 +164,7 @@ def main() -> int:
     parser.add_argument("-n", "--count", type=int, default=500, help="cases; default: 500")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
     parser.add_argument(
-        "--kind", action="append", choices=[*KINDS, *LONG_KINDS, RUN_FOLDERS], help="default: all in turn"
+        "--kind", action="append", choices=[*KINDS, *LONG_KINDS, ASSETS, RUN_FOLDERS], help="default: all in turn"
     )
     parser.add_argument("--only", type=int, help="this case of the kind alone")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the inputs there")

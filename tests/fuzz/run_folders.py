@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from random import Random
 
-from fuzz.mutators import NUMBERS, WORDS, spoiled
-
-VALUES = [None, True, 0, -1, 1e300, float("inf"), float("nan"), "", "x", [], [1], {}, {"a": 1}, "\ud800", 10**30]
+from fuzz.json_values import changed
+from fuzz.mutators import spoiled
 
 
 def run_folder(rng: Random, folder: Path) -> list[str]:
@@ -19,7 +17,7 @@ def run_folder(rng: Random, folder: Path) -> list[str]:
         path = rng.choice(files)
         kind = rng.randrange(6)
         if kind in (0, 4, 5) and path.suffix in (".json", ".jsonl") and path.exists():
-            path.write_text("".join(_changed(rng, line) for line in _documents(path)))
+            path.write_text("".join(changed(rng, line) for line in _documents(path)))
         elif kind == 1:
             path.unlink(missing_ok=True)
         elif kind == 2:
@@ -54,24 +52,3 @@ def run_folder(rng: Random, folder: Path) -> list[str]:
 def _documents(path: Path) -> list[str]:
     text = path.read_text(errors="replace")
     return text.splitlines(keepends=True) if path.suffix == ".jsonl" else [text]
-
-
-def _changed(rng: Random, text: str) -> str:
-    """A JSON document with one of its values replaced, or an entry renamed."""
-    try:
-        data = json.loads(text)
-    except ValueError:
-        return text
-    holders = [data]
-    for holder in holders:
-        inner = holder.values() if isinstance(holder, dict) else holder if isinstance(holder, list) else []
-        holders += [item for item in inner if isinstance(item, dict | list)]
-    holder = rng.choice(holders)
-    value = rng.choice([*VALUES, *NUMBERS, *WORDS])
-    if isinstance(holder, dict) and holder:
-        holder[rng.choice(sorted(holder))] = value
-    elif isinstance(holder, list) and holder:
-        holder[rng.randrange(len(holder))] = value
-    else:
-        data = value
-    return json.dumps(data) + "\n"

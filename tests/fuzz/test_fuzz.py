@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from fuzz.forked import HANG, OTHER, REFUSED, SIGNAL, TRACEBACK, USAGE, WORKS, Forked, Outcome
-from fuzz.fuzzer import Fuzzer, table
+from fuzz.fuzzer import ASSETS, Fuzzer, table
 from fuzz.mutators import KINDS
 from fuzz.seeds import small_exr, write_seeds
 
@@ -21,7 +21,7 @@ def fuzzer() -> Iterator[Fuzzer]:
         yield found
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, ASSETS])
 def test_spoiled_input(fuzzer: Fuzzer, kind: str) -> None:
     cases = [fuzzer.case(kind, number) for number in range(CASES_A_KIND)]
     print(table(cases))

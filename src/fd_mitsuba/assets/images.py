@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from fd_mitsuba.assets.asset import TextureImage
 from fd_mitsuba.assets.broken import BrokenAsset
@@ -87,6 +87,10 @@ def checked_image(name: str, data: bytes) -> TextureImage:
             image.load()
     except BrokenAsset:
         raise
+    except UnidentifiedImageError:
+        raise BrokenAsset(
+            f"its image {shown!r} is damaged, or of no kind that is read; save it as PNG or JPEG"
+        ) from None
     except Exception as error:  # Pillow's readers raise many kinds
         problem = f"its image {shown!r} cannot be read ({' '.join(str(error).split())[:80] or 'damaged'})"
         raise BrokenAsset(f"{problem}; save it as PNG or JPEG") from None

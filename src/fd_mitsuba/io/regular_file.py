@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 _KINDS = (
     (stat.S_ISDIR, "is a folder"),
@@ -13,6 +14,7 @@ _KINDS = (
     (stat.S_ISCHR, "is a device, not a regular file"),
     (stat.S_ISBLK, "is a device, not a regular file"),
 )
+_PIECE = 1 << 24
 
 
 class NotReadable(Exception):
@@ -51,12 +53,21 @@ def read_regular(path: Path, limit: int) -> bytes:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         with open(number, "rb") as file:
             _refuse_kind_and_size(os.fstat(number), limit)
-            data = file.read(limit + 1)
+            data = _at_most(file, limit + 1)
     except OSError as error:
         raise NotReadable(_reason(error)) from None
     if len(data) > limit:
         raise NotReadable(f"is larger than {_size(limit)}")
     return data
+
+
+def _at_most(file: BinaryIO, count: int) -> bytes:
+    """What `file.read(count)` gives, which would set aside `count` bytes first, however small the file is."""
+    pieces = []
+    while count and (piece := file.read(min(count, _PIECE))):
+        pieces.append(piece)
+        count -= len(piece)
+    return b"".join(pieces)
 
 
 def _refuse_kind_and_size(status: os.stat_result, limit: int) -> None:
