@@ -115,8 +115,9 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     step = slower * (0.03 + field + surface) + (image if geometry.lambda_sds > 0 else 0.0)
     size = SceneSize.of(scene)
     more_faces, more_light = size.faces / 1e6, size.light_pixels / 1e6
+    processor = f"{cores} core{'' if cores == 1 else 's'} of {processor_speed() / 1e9:.3g} GFLOP/s"
     assumptions = (
-        f"{cores} cores of {processor_speed() / 1e9:.3g} GFLOP/s, otherwise idle, views at the size of the latent",
+        f"{processor}, otherwise idle, views at the size of the latent",
         "that Mitsuba's kernels are in its cache: a first run compiles them, some 20 s more",
         *([] if speed is None else [speed.text]),
         f"a base of {size.faces} faces, light of {more_light:.3g} million pixels",
