@@ -48,6 +48,7 @@ def _no_scenes_of_other_files() -> None:
     of them cannot do what is asked: a checkerboard as bump map is enough.
     """
     gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -137,9 +137,9 @@ def test_preview_wants_a_folder(tmp_path: Path, capfd: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("place", "mode"),
     [
-        ('<scale value="0.1"/><translate x="0.3" y="1.1"/>', "add"),
         ('<scale value="0.1"/><translate x="40"/>', "add"),
-        ('<scale value="30"/>', "add"),
+        pytest.param('<scale value="0.1"/><translate x="0.3" y="1.1"/>', "add", marks=pytest.mark.slow),
+        pytest.param('<scale value="30"/>', "add", marks=pytest.mark.slow),
         ('<scale value="0.04"/><translate x="0.55" y="0.5" z="-0.4"/>', "subtract"),
     ],
 )

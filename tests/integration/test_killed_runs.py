@@ -131,10 +131,9 @@ def test_killed_at_40_random_moments_of_both_stages(place: Path, whole: tuple[di
     kill_until_done(place, whole, kills=40, seed=random.randrange(10**6))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(
-    "waited_for", ["images/channels.png", pytest.param("export/part.json", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("waited_for", ["images/channels.png", "export/part.json"])
 def test_interrupted_while_it_bakes_or_exports(place: Path, waited_for: str) -> None:
     """After the last step nobody is in a loop that could save: the files that are there are whole, the rest is made."""
     output, more = f"baking_{Path(waited_for).stem}", ("--set", "output.texture_size=512")

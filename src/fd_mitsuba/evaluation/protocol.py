@@ -66,14 +66,23 @@ def judged(
     return found
 
 
-def measured(scene: EditScene, folder: Path, views: JudgedViews) -> dict:
-    """What needs no judge: base, part, locality, cost; the last two as the run itself has measured them."""
+def measured_by_run(folder: Path) -> dict:
+    """`metrics.json` of a run folder.
+
+    Raises:
+        UserError: it lacks something that every run has measured, or a number is none.
+    """
     metrics = read_json_object(folder / "metrics.json") or {}
     missing = [name for name in _MEASURED if name not in metrics]
     numbers = [metrics.get(name) for name in ("inside_fraction", "overlap_fraction", "seconds")]
     if missing or not all(isinstance(number, int | float) for number in numbers):
         what = f"no {missing[0]}" if missing else "a metric is no number"
         raise UserError(f"{folder / 'metrics.json'}: is damaged ({what}); go on with the run by --resume")
+    return metrics
+
+
+def measured(scene: EditScene, folder: Path, views: JudgedViews, metrics: dict) -> dict:
+    """What needs no judge: base, part, locality, cost; the last two as the run itself has measured them."""
     return {
         "base": {
             "identical": metrics["base_identical"],

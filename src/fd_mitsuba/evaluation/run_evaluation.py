@@ -16,7 +16,7 @@ from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.boundary_step import boundary_step
 from fd_mitsuba.evaluation.judged_views import VIEWS_TOGETHER, JudgedViews, lit_views, shape_views
-from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured
+from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured, measured_by_run
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
 from fd_mitsuba.evaluation.scene_prompts import ScenePrompts, prompts_of_scene
 from fd_mitsuba.evaluation.similarity import EditPrompt, Judge
@@ -91,6 +91,7 @@ def evaluate_run(
     known = read_json_object(path) or {}
     if not again and known.get("key") == key and _is_whole(known):
         return known
+    metrics = measured_by_run(folder)  # first: all the rest takes its time
     scene, config = saved_run(folder, say=say)
     appearance = None if protocol.pictures == "shape" else finished_appearance(scene, config, folder)
     if appearance is None and protocol.pictures == "lit":
@@ -120,7 +121,7 @@ def evaluate_run(
         "judge": judge.name,
         "views": about_views(views),
         **judged(views, judge, own, simple, among, vocabulary),
-        **measured(scene, folder, views),
+        **measured(scene, folder, views, metrics),
     }
     if appearance is not None and not scene.subtracts:
         reach = config.appearance.boundary_reach
