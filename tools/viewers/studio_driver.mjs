@@ -1,4 +1,5 @@
 // What a person does with the page of `fd_mitsuba studio`, in headless Chromium.
+import { join } from "node:path";
 import { withBrowser } from "./browser.mjs";
 
 // Calls `drive(browser)` with a browser of the size that `options` may have.
