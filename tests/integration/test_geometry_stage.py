@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from fd_mitsuba.errors import Interrupted, RunStopped, UserError
 from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.load_scene import load_edit_scene
+from fd_mitsuba.training.checkpoint import load_trained
 from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import StepRecord
@@ -180,6 +182,39 @@ def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., Geo
 
     assert run(9, resume=False) == list(range(10))
     assert run(-1, resume=True) == list(range(10, VANISHED_AFTER))
+
+
+def test_the_average_is_what_is_exported_and_goes_through_checkpoints(
+    stage: Callable[..., GeometryStage], tmp_path: Path, one_thread: None
+) -> None:
+    def run(folder: Path, stop_after: int | None, resume: bool) -> GeometryStage:
+        found = stage(+1.0, steps=4, average=0.5)
+        real = found.step
+
+        def step(number: int) -> StepRecord:
+            if number == stop_after:
+                os.kill(os.getpid(), signal.SIGINT)
+            return real(number)
+
+        found.step = step  # type: ignore[method-assign]
+        with nullcontext() if stop_after is None else pytest.raises(Interrupted):
+            run_stage(found, folder, resume, quiet=True, say=lambda _: None)
+        return found
+
+    whole = run(tmp_path / "whole", None, False)
+    run(tmp_path / "half", 1, False)
+    resumed = run(tmp_path / "half", None, True)
+    again = stage(+1.0, steps=4, average=0.5)
+    assert load_trained(tmp_path / "whole", again, again.config.content_hash("geometry"))
+    assert whole.average is not None and whole.grown().field is whole.average.module is whole.final_field
+    last = dict(whole.field.named_parameters())
+    for other in (resumed, again):
+        for name, averaged in other.final_field.named_parameters():
+            assert torch.equal(averaged, dict(whole.final_field.named_parameters())[name])
+            assert not averaged.requires_grad
+    different = [name for name, value in whole.final_field.named_parameters() if not torch.equal(value, last[name])]
+    assert different
+    assert not torch.equal(whole.extractor(whole.field).vertices, whole.surface().vertices)
 
 
 def test_a_field_that_is_not_finite_stops_the_run(stage: Callable[..., GeometryStage]) -> None:

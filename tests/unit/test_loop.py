@@ -28,7 +28,7 @@ class CountingStage:
         self.field = torch.nn.Linear(1, 1)
         self.optimiser = torch.optim.SGD(self.field.parameters(), lr=1.0)
         self.at = at or {}
-        self.counters = {"steps": 0}
+        self.counters, self.average = {"steps": 0}, None
         self.name, self.steps = "geometry", steps
         with torch.no_grad():
             self.field.weight.zero_()

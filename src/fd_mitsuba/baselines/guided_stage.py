@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.training.geometry_stage import GeometryStage
+from fd_mitsuba.training.weight_average import WeightAverage
 
 
 class GuidedStage:
@@ -14,6 +15,7 @@ class GuidedStage:
     """
 
     name = "geometry"
+    average: WeightAverage | None = None
 
     def __init__(self, own: GeometryStage) -> None:
         self.own, self.config = own, own.config

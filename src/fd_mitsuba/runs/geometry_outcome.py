@@ -149,7 +149,7 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
     write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
     identical = copy_base(scene, export / "base")
     # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
-    vertices, faces = stage.extractor.extract_part(stage.field)
+    vertices, faces = stage.extractor.extract_part(stage.final_field)
     base, grown = scene.base_canonical, (vertices.numpy(), faces.numpy())
     locality = measure_locality(grown, (base.vertices, base.faces), scene.regions, config.geometry.focal_band)
     # Parts may join the base through each other, so that their gaps are those of all together.

@@ -41,6 +41,7 @@ from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
 from fd_mitsuba.training.surface_points import points_on
+from fd_mitsuba.training.weight_average import WeightAverage
 from fd_mitsuba.viewing.sheets import appearance_sheet
 
 _POOL = 32768
@@ -88,6 +89,7 @@ class AppearanceStage:
         if guidance is not None:
             self.field.to(field_device(config.guidance))
         self.optimiser = adamw(self.field, settings)
+        self.average: WeightAverage | None = None
         size = settings.picture_size or (guidance.appearance_size if guidance is not None else 128)
         self.shading = PartShading.of(self.material)
         self.rendering = AppearancePass(

@@ -24,6 +24,7 @@ from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import parse_json_object
 from fd_mitsuba.training.stage import Stage
+from fd_mitsuba.training.weight_average import WeightAverage
 
 FORMAT = 1
 _HEADER_KEY = "fd_mitsuba"
@@ -57,6 +58,7 @@ def save_checkpoint(
     optimiser: torch.optim.Optimizer,
     keep: int,
     guidance: Any = None,
+    average: WeightAverage | None = None,
 ) -> Path:
     """Write a checkpoint so that it is there whole or not at all, then remove all but the newest `keep`.
 
@@ -64,6 +66,7 @@ def save_checkpoint(
 
     Args:
         guidance: whose `learned_state`, where it has one, is kept too.
+        average: of the field, where there is one.
 
     Raises:
         UserError: the folder cannot be written (full, read-only).
@@ -72,6 +75,8 @@ def save_checkpoint(
     for index, state in optimiser.state_dict()["state"].items():
         for name, value in state.items():
             tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value).contiguous()
+    if average is not None:
+        tensors |= {f"average.{name}": value.contiguous() for name, value in average.module.state_dict().items()}
     if hasattr(guidance, "learned_state"):
         tensors |= {f"guidance.{name}": value for name, value in guidance.learned_state().items()}
     text = json.dumps({**vars(header), "sha256": _digest(tensors)}, sort_keys=True)
@@ -98,11 +103,12 @@ def load_newest(
     optimiser: torch.optim.Optimizer,
     counters: dict[str, int] | None = None,
     guidance: Any = None,
+    average: WeightAverage | None = None,
 ) -> tuple[int, list[str]]:
     """Load the newest whole checkpoint into the field and the optimiser, and its counters into `counters` if given.
 
     Args:
-        guidance: gets back what `save_checkpoint` has kept of it.
+        guidance, average: get back what `save_checkpoint` has kept of them.
 
     Returns:
         The number of finished steps (0 without a checkpoint), and a line for each damaged file that was passed over.
@@ -123,7 +129,7 @@ def load_newest(
         if header.get("sha256") != _digest(tensors):
             remarks.append(f"{path}: damaged checkpoint passed over (its tensors do not fit their hash)")
             continue
-        _apply(path, tensors, field, optimiser)
+        _apply(path, tensors, field, optimiser, average)
         _teach(path, tensors, guidance)
         if counters is not None:
             counters.update(header.get("counters", {}))
@@ -140,7 +146,8 @@ def load_trained(run: Path, stage: Stage, config_hash: str) -> bool:
     folder = checkpoint_folder(run, stage.name)
     if not list_checkpoints(folder):
         return False
-    done, remarks = load_newest(folder, stage.name, config_hash, stage.field, stage.optimiser, stage.counters)
+    own = stage.field, stage.optimiser, stage.counters
+    done, remarks = load_newest(folder, stage.name, config_hash, *own, average=stage.average)
     if not done:
         newest = remarks[0].removeprefix(f"{folder}/") if remarks else ""
         raise UserError(f"{folder}: every checkpoint is damaged ({newest}); run the {stage.name} stage again")
@@ -183,11 +190,19 @@ def _checked_header(path: Path, header: object, stage: str, config_hash: str) ->
     return header
 
 
-def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: torch.optim.Optimizer) -> None:
-    own = field.state_dict()
-    stored = {name[6:]: value for name, value in tensors.items() if name.startswith("field.")}
-    if {n: v.shape for n, v in own.items()} != {n: v.shape for n, v in stored.items()}:
-        raise UserError(f"{path}: its tensors do not fit this field; choose another -o folder")
+def _apply(
+    path: Path,
+    tensors: dict[str, Tensor],
+    field: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    average: WeightAverage | None,
+) -> None:
+    modules = {"field.": field} | ({} if average is None else {"average.": average.module})
+    found = {}
+    for start, module in modules.items():
+        found[start] = {name[len(start) :]: value for name, value in tensors.items() if name.startswith(start)}
+        if {n: v.shape for n, v in module.state_dict().items()} != {n: v.shape for n, v in found[start].items()}:
+            raise UserError(f"{path}: its tensors do not fit this field; choose another -o folder")
     bad = [name for name, value in tensors.items() if value.is_floating_point() and not torch.isfinite(value).all()]
     if bad:
         raise UserError(
@@ -203,5 +218,6 @@ def _apply(path: Path, tensors: dict[str, Tensor], field: nn.Module, optimiser: 
             moments.setdefault(int(index), {})[key] = value
     state = optimiser.state_dict()
     state["state"] = moments
-    field.load_state_dict(stored)
+    for start, module in modules.items():
+        module.load_state_dict(found[start])
     optimiser.load_state_dict(state)

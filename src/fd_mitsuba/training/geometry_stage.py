@@ -37,6 +37,7 @@ from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
+from fd_mitsuba.training.weight_average import WeightAverage
 from fd_mitsuba.viewing.sheets import geometry_sheet
 
 VANISHED_AFTER = 25
@@ -86,6 +87,7 @@ class GeometryStage:
         self.base_surface = self._base_surface()
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, geometry)
+        self.average = WeightAverage(self.field, geometry.average) if geometry.average > 0 else None
         self.focus = bounding_ball(points[(self.region_sdf > 0).numpy()])
         self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
@@ -121,9 +123,14 @@ class GeometryStage:
         count = self.config.geometry.views
         return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
 
+    @property
+    def final_field(self) -> PartField:
+        """The field that is exported: the average where there is one, without gradients, else the learned one."""
+        return self.field if self.average is None else self.average.module
+
     def surface(self) -> UnionSurface:
-        """The surface of the base with the part, or without it, for the present parameters; with gradients."""
-        return self.extractor(self.field)
+        """The surface of the base with the part, or without it, for `final_field` as it is."""
+        return self.extractor(self.final_field)
 
     def start_surface(self) -> UnionSurface:
         """`surface` with what the part starts as, the focal regions or a variation of them, without gradients."""
@@ -132,7 +139,7 @@ class GeometryStage:
 
     def grown(self) -> GrownPart:
         """What exports need of the stage. It follows the field: later steps change it."""
-        return GrownPart(self.scene.parts, self.scene.base_canonical, self.extractor, self.field)
+        return GrownPart(self.scene.parts, self.scene.base_canonical, self.extractor, self.final_field)
 
     def step(self, step: int) -> StepRecord:
         """Run step `step` (counted from 0 over both phases) and change the field once.
@@ -172,6 +179,8 @@ class GeometryStage:
         weights = {"sds": geometry.lambda_sds, **self.field_losses.weights}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
         values.update(descend(self.optimiser, losses, weights, step, remedy))
+        if self.average is not None:
+            self.average.update(self.field, step)
         values["part_faces"] = float(surface.face_is_part.sum())
         return StepRecord(values, partial(geometry_sheet, pictures.detach(), preview))
 

@@ -42,7 +42,7 @@ def run_stage(
     config_hash, total = config.content_hash(stage.name), stage.steps
     done, guidance = 0, getattr(stage, "guidance", None)
     if resume:
-        own = stage.field, stage.optimiser, stage.counters, guidance
+        own = stage.field, stage.optimiser, stage.counters, guidance, stage.average
         done, remarks = load_newest(checkpoints, stage.name, config_hash, *own)
         for remark in remarks:
             say(remark)
@@ -50,7 +50,8 @@ def run_stage(
 
     def save(step: int) -> None:
         header = CheckpointHeader(stage.name, step, config_hash, counters=dict(stage.counters))
-        save_checkpoint(checkpoints, header, stage.field, stage.optimiser, config.output.checkpoints_kept, guidance)
+        kept = config.output.checkpoints_kept
+        save_checkpoint(checkpoints, header, stage.field, stage.optimiser, kept, guidance, stage.average)
 
     group = processes()
     recording = Recorder(folder, stage.name, total, done, quiet) if group.writes else nullcontext()

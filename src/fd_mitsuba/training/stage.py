@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.training.weight_average import WeightAverage
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,11 @@ class Stage(Protocol):
 
     @property
     def optimiser(self) -> torch.optim.Optimizer: ...
+
+    @property
+    def average(self) -> WeightAverage | None:
+        """Of the field over the steps, where there is one: a part of the checkpoints."""
+        ...
 
     @property
     def counters(self) -> dict[str, int]:

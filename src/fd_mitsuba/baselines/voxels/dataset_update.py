@@ -29,6 +29,7 @@ from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
+from fd_mitsuba.training.weight_average import WeightAverage
 from fd_mitsuba.viewing.sheets import as_bytes, stacked
 
 EditView = Callable[[CameraBatch, Beginning], EditedImages]
@@ -67,6 +68,7 @@ class DatasetUpdateStage:
     """
 
     name = "geometry"
+    average: WeightAverage | None = None
 
     def __init__(
         self,
