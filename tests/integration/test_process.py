@@ -32,6 +32,6 @@ def test_names_that_are_no_text_are_one_line(tmp_path: Path, capfd: pytest.Captu
     scene.write_bytes(SCENE.read_bytes())
     assert main(["check", str(scene)]) == 1
     message = capfd.readouterr().err
-    assert message.count("\n") == 1 and "k\\udce4tze" in message and "is not UTF-8 text; rename" in message
+    assert message.count("\n") == 1 and "k\\udce4tze" in message and "is not UTF-8 text; write it so, rename" in message
     with pytest.raises(fd.UserError, match="reads no path that is not UTF-8 text; rename the folder"):
         fd.load_scene(scene)

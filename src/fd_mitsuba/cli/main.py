@@ -108,11 +108,12 @@ def _open_standard_streams() -> None:
 
 def _require_text(arguments: list[str]) -> None:
     """UserError for an argument that holds bytes which are no text: Mitsuba takes no such file names."""
-    for argument in arguments:
+    for argument, before in zip(arguments, ["", *arguments], strict=False):
         if not is_text(argument):
+            option = f"{before} " if before.startswith("-") else ""
             raise UserError(
-                f"{ascii(argument)}: is not UTF-8 text; rename the file or folder, or set a UTF-8 locale, as by "
-                "LC_ALL=C.UTF-8"
+                f"{option}{ascii(argument)}: is not UTF-8 text; write it so, rename the file or folder, or set a UTF-8 "
+                "locale, as by LC_ALL=C.UTF-8"
             )
 
 
