@@ -49,6 +49,7 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_blocks_of_the_python_page_run_in_order(tiny_quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = ROOT / "docs" / "api.md"
