@@ -74,8 +74,8 @@ class GeometryConfig(OptimisedSection):
     learning_rate: Rate = 1e-3
     """Step size of AdamW."""
     average: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """The part that is exported has an average of the field's weights over the steps, with this factor a step: smoother,
-    and less sharp where the shape still changes. 0: the last step's own; not in the paper."""
+    """The part that is exported has an average of the field's weights over the steps, with this factor a step:
+    smoother, and less sharp where the shape still changes. 0: the last step's own; not in the paper."""
     grid_resolution: Annotated[int, Field(ge=8, le=256)] = 64
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
     union_k: Length = 0.15
