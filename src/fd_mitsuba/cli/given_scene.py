@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fd_mitsuba.assets.readers import is_asset
-from fd_mitsuba.cli.options import definitions, given_text, remark
+from fd_mitsuba.cli.options import definitions, remark
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.json_object import read_json_object, write_json
 
@@ -64,7 +64,7 @@ def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[s
     if options.regions is not None and options.at:
         raise UserError("--at and --regions: give one of the two")
     wanted = {
-        "prompt": None if options.prompt is None else given_text("--prompt", options.prompt),
+        "prompt": options.prompt,
         "up": options.up,
         "front": options.front,
         "at": list(options.at),

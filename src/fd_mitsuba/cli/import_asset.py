@@ -6,7 +6,7 @@ import argparse
 import shlex
 from pathlib import Path
 
-from fd_mitsuba.cli.options import given_text, say
+from fd_mitsuba.cli.options import say
 from fd_mitsuba.cli.scene_options import axis_options, placing_options
 
 
@@ -35,8 +35,8 @@ def _import(options: argparse.Namespace) -> int:
     imported = import_asset(
         path,
         folder,
-        prompt=None if options.prompt is None else given_text("--prompt", options.prompt),
-        base_prompt=None if options.base_prompt is None else given_text("--base-prompt", options.base_prompt),
+        prompt=options.prompt,
+        base_prompt=options.base_prompt,
         up=options.up,
         front=options.front,
         units=options.units,

@@ -43,16 +43,6 @@ def remark(line: str) -> None:
     print(f"fd_mitsuba: {printable(line)}", file=sys.stderr)
 
 
-def given_text(option: str, value: str) -> str:
-    """The value of an option that is text; UserError where it is not UTF-8, so that no file could hold it."""
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        problem = "holds bytes that are not UTF-8; give it in the terminal's encoding"
-        raise UserError(f"{option} {value}: {problem}") from None
-    return value
-
-
 def definitions(options: argparse.Namespace) -> dict[str, str]:
     """The `-D` values by name."""
     parameters = {}
@@ -60,7 +50,7 @@ def definitions(options: argparse.Namespace) -> dict[str, str]:
         name, separator, value = item.partition("=")
         if not separator or not name:
             raise UserError(f"-D {item}: write -D name=value")
-        parameters[name] = given_text("-D", value)
+        parameters[name] = value
     return parameters
 
 

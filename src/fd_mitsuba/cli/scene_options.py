@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fd_mitsuba.cli.options import definitions, given_text, machine_options, quiet_libraries
+from fd_mitsuba.cli.options import definitions, machine_options, quiet_libraries
 from fd_mitsuba.errors import UserError
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def load(
     return load_scene(
         options.scene,
         parameters,
-        prompt=None if options.prompt is None else given_text("--prompt", options.prompt),
+        prompt=options.prompt,
         regions=options.regions,
         threads=options.threads,
         variant=options.variant,

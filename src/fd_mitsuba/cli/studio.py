@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fd_mitsuba.assets.readers import is_asset
 from fd_mitsuba.cli.given_scene import prepare_scene, scene_label
-from fd_mitsuba.cli.options import definitions, given_text, machine_options, remark, say, start
+from fd_mitsuba.cli.options import definitions, machine_options, remark, say, start
 from fd_mitsuba.cli.scene_options import axis_options, placing_options, settings_options
 from fd_mitsuba.errors import UserError
 
@@ -45,7 +45,7 @@ def _studio(options: argparse.Namespace) -> int:
 
     require_viser()
     parameters = definitions(options)
-    prompt = None if options.prompt is None else given_text("--prompt", options.prompt)
+    prompt = options.prompt
     from fd_mitsuba.studio.settings import PRESETS, StudioSettings
 
     preset = PRESETS[0] if options.config is None else str(options.config)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.regular_file import NotReadable, read_regular
+from fd_mitsuba.io.safe_text import is_text
 
 PRESETS_FOLDER = Path(__file__).with_name("presets")
 _MOST_BYTES = 1 << 20
@@ -64,7 +65,7 @@ def apply_override(data: dict[str, Any], item: str) -> str:
     """Write the override's value into `data`; returns its key without blanks."""
     key, separator, text = item.partition("=")
     key, text = key.strip(), text.strip()
-    if not item.isascii() and any("\ud800" <= letter <= "\udfff" for letter in item):
+    if not is_text(item):
         raise UserError(f"--set {shortened(item)}: holds bytes that are not UTF-8; give it in the terminal's encoding")
     if not separator or not key:
         raise UserError(f"--set {shortened(item)}: write section.key=value, as in --set geometry.steps=200")
