@@ -24,6 +24,7 @@ def add_training(actions: argparse._SubParsersAction) -> None:
     train.add_argument("--data", metavar="FOLDER", help="train on stored pairs of build-data instead of fresh ones")
     train.add_argument("--bf16", action="store_true", help="bfloat16: faster on a processor that has it (AVX512-BF16)")
     train.add_argument("--batch", type=int, default=8, metavar="N", help="images a step; default: 8")
+    train.add_argument("--rate", type=float, metavar="R", help="highest learning rate; default: the kind's own")
     train.add_argument("--device", default="cpu", help="cpu or cuda; with cuda, render by --workers or from --data")
     train.add_argument(
         "--workers", type=int, default=0, metavar="N", help="processes that render; default: the training itself"
@@ -69,6 +70,7 @@ def _prior_train(options: argparse.Namespace) -> int:
             options.hours * 3600,
             kind=kind,
             total_steps=options.steps,
+            rate=options.rate,
             seed=options.seed,
             init=init,
             pairs=StoredPairs(Path(options.data), kind, options.seed) if options.data else None,

@@ -68,17 +68,27 @@ class Pool:
         return base, edited, changed, [p.caption for p in chosen]
 
 
-class WorkerPool(Pool):
+class WorkerPool:
     """A pool that processes fill beside the training, as fast as they can: a GPU must not wait for pictures.
 
     Which pairs are there at a step depends on the machine, so that only a training with `Pool` follows from its seed.
 
     Args:
         workers: processes; each renders on one core, from seeds of its own.
+        capacity: pairs that are kept, the most recent ones.
+        device: where they are kept and batches come from.
     """
 
-    def __init__(self, kind: Kind, seed: int, workers: int, capacity: int = 20000) -> None:
-        super().__init__(kind, seed, capacity)
+    def __init__(
+        self, kind: Kind, seed: int, workers: int, capacity: int = 20000, device: torch.device | str = "cpu"
+    ) -> None:
+        side = 2 * kind.view_size
+        self._rng, self._made, self._device = np.random.default_rng(seed), 0, device
+        self._base, self._edited = (
+            torch.empty((capacity, 4, side, side), dtype=torch.int8, device=device) for _ in range(2)
+        )
+        self._changed = torch.empty((capacity, 1, side, side), dtype=torch.bool, device=device)
+        self._captions = [""] * capacity
         context = multiprocessing.get_context("spawn")  # a forked process would share Mitsuba's threads
         self._queue = context.Queue(_QUEUED)
         self._processes = [
@@ -88,6 +98,11 @@ class WorkerPool(Pool):
         for process in self._processes:
             process.start()
 
+    @property
+    def made(self) -> int:
+        """Pairs taken in so far."""
+        return self._made
+
     def refresh(self, count: int) -> None:
         """Take in what the workers have made; waits only while there are less than `count` pairs in all.
 
@@ -95,17 +110,35 @@ class WorkerPool(Pool):
             UserError: the workers have stopped.
         """
         for _ in range(_QUEUED):
-            self._take(0.0)
-        while len(self._pairs) < count:
+            if not self._take(0.0):
+                break
+        while self._made < count:
             self._take(_PATIENCE_SECONDS)
 
-    def _take(self, seconds: float) -> None:
-        """Add what a worker has made, if there is something within that time."""
+    def _take(self, seconds: float) -> bool:
+        """Add what a worker has made, if there is something within that time; whether there was."""
         with contextlib.suppress(queue.Empty):
-            self._pairs.extend(self._queue.get(timeout=seconds))
-            return
+            self._store(*self._queue.get(timeout=seconds))
+            return True
         if not any(process.is_alive() for process in self._processes):
             raise UserError("--workers: the processes that render pictures have stopped; see above")
+        return False
+
+    def _store(self, base: np.ndarray, edited: np.ndarray, changed: np.ndarray, captions: list[str]) -> None:
+        places = (self._made + np.arange(len(captions))) % len(self._captions)
+        rows = torch.from_numpy(places).to(self._device)
+        for kept, new in ((self._base, base), (self._edited, edited), (self._changed, changed[:, None])):
+            kept[rows] = torch.from_numpy(new).to(self._device)
+        for place, text in zip(places, captions, strict=True):
+            self._captions[place] = text
+        self._made += len(captions)
+
+    def batch(self, size: int) -> Batch:
+        """As `Pairs.batch`, on the pool's device."""
+        chosen = self._rng.integers(min(self._made, len(self._captions)), size=size)
+        rows = torch.from_numpy(chosen).to(self._device)
+        base, edited = self._base[rows].float() / 127, self._edited[rows].float() / 127
+        return base, edited, self._changed[rows].float(), [self._captions[i] for i in chosen]
 
     def close(self) -> None:
         """End the workers."""
@@ -121,4 +154,8 @@ def _fill(pairs: multiprocessing.Queue, kind_name: str, seed: int, number: int) 
     share_cores(1)
     kind, rng = kind_named(kind_name), np.random.default_rng([seed, number, 1])
     while True:
-        pairs.put(draw_pairs(kind, rng))
+        made = draw_pairs(kind, rng)
+        if made:
+            # Arrays of all at once: thousands of small objects a second would keep the training busy with unpacking.
+            base, edited, changed = zip(*((pair.base, pair.edited, pair.changed()) for pair in made), strict=True)
+            pairs.put((np.stack(base), np.stack(edited), np.stack(changed), [pair.caption for pair in made]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,15 @@ from torch.nn.functional import avg_pool2d
 
 from fd_mitsuba.errors import Interrupted, UserError
 from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
-from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, tokenize
+from fd_mitsuba.prior.training.model import TokenRows, build_scheduler, build_tokenizer
 from fd_mitsuba.prior.training.pool import Pairs, Pool, WorkerPool
-from fd_mitsuba.prior.training.replicas import Replicas
-from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow, smoothed
+from fd_mitsuba.prior.training.recorded_step import RecordedStep
+from fd_mitsuba.prior.training.step import TrainingStep
+from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow
 from fd_mitsuba.prior.training.warm_start import load_start
 from fd_mitsuba.training.stop_request import stop_on_signals
 
 LOG_EVERY = 50
-ShareLoss = tuple[torch.Tensor, torch.Tensor]
 
 
 def train(
@@ -31,6 +30,7 @@ def train(
     kind: Kind = GEOMETRY,
     batch_size: int = 8,
     total_steps: int | None = None,
+    rate: float | None = None,
     seed: int = 0,
     init: Path | None = None,
     pairs: Pairs | None = None,
@@ -44,6 +44,7 @@ def train(
         folder: checkpoints and log; written every five minutes and at the end.
         kind: which prior.
         total_steps: length of the schedule; None: the kind's own.
+        rate: highest learning rate; None: the kind's own, which goes with small batches.
         init: optional folder of packed weights to start from instead of random ones; no step is small then. A coarser
             prior's start a finer one, see `warm_start`.
         pairs: what to train on instead of freshly rendered pictures.
@@ -63,8 +64,12 @@ def train(
     unet: Any = modules["unet"]
     unet.to(memory_format=torch.channels_last)
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
+    on_card = place.type == "cuda"
+    # A recorded step reads its rate from the card.
+    highest = kind.learning_rate if rate is None else rate
+    first_rate = torch.tensor(highest, device=place) if on_card else highest
     optimiser = torch.optim.AdamW(
-        modules.parameters(), lr=kind.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
+        modules.parameters(), lr=first_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True, capturable=on_card
     )
     before = 0.0
     step, small_steps = 0, 0 if init is not None else kind.small_steps
@@ -79,16 +84,20 @@ def train(
             )
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
+        for group in optimiser.param_groups:
+            group |= {"lr": first_rate, "capturable": on_card}
         average = {key: value.to(place) for key, value in state["average"].items()}
         step, before = state["step"], state.get("seconds", 0.0)
         small_steps = state.get("small_steps", kind.small_steps)
-    replicas = Replicas(modules, min(torch.get_num_threads(), batch_size) if place.type == "cpu" else 1)
-    alphas = scheduler.alphas_cumprod.to(place)
-    generator = torch.Generator(place).manual_seed(seed * 1_000_003 + step)
+    step_of_batch: Any = TrainingStep(modules, optimiser, kind, scheduler, half, seed * 1_000_003 + step)
+    if on_card:
+        step_of_batch = RecordedStep(step_of_batch, step_of_batch.generator)
+    drops = torch.Generator().manual_seed(seed * 1_000_003 + step)
     own_seed = seed * 7919 + step
-    crew = WorkerPool(kind, own_seed, workers) if workers and pairs is None else None
+    crew = WorkerPool(kind, own_seed, workers, device=place) if workers and pairs is None else None
     pool = crew or pairs or Pool(kind, own_seed)
     pool.refresh(min(600, total_steps * batch_size))
+    rows = TokenRows(tokenizer)
     started, smooth = time.time(), None
 
     def save() -> None:
@@ -100,51 +109,31 @@ def train(
     with stop_on_signals() as stop:
         while step < total_steps and time.time() - started < seconds and stop.name is None:
             warm = min(1.0, (step + 1) / 150)
-            rate = float(kind.learning_rate * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
+            now = float(highest * warm * (0.04 + 0.96 * 0.5 * (1 + np.cos(np.pi * step / total_steps))))
             for group in optimiser.param_groups:
-                group["lr"] = rate
+                group["lr"] = group["lr"].fill_(now) if isinstance(group["lr"], torch.Tensor) else now
             *pictures, captions = pool.batch(batch_size)
-            base, edited, changed = (picture.to(place, non_blocking=True) for picture in pictures)
+            draw = torch.rand(batch_size, generator=drops)
+            captions = ["" if u < 0.1 else c for u, c in zip(draw.tolist(), captions, strict=True)]
+            keep_base = (~((draw > 0.06) & (draw < 0.14))).float()[:, None, None, None]
+            base, edited, changed, keep_base, tokens = (
+                values.to(place, non_blocking=True) for values in (*pictures, keep_base, rows(captions))
+            )
             if step < small_steps:
                 base, edited = avg_pool2d(base, 2), avg_pool2d(edited, 2)
                 changed = (avg_pool2d(changed, 2) > 0.4).float()
-            draw = torch.rand(batch_size, generator=generator, device=place).tolist()
-            captions = ["" if u < 0.1 else c for u, c in zip(draw, captions, strict=True)]
-            keep_base = torch.tensor([0.0 if 0.06 < u < 0.14 else 1.0 for u in draw], device=place)[:, None, None, None]
-            times = (
-                (1000 * torch.rand(batch_size, generator=generator, device=place) ** kind.time_power)
-                .long()
-                .clamp(max=999)
-            )
-            noise = torch.randn(edited.shape, generator=generator, device=place)
-            if kind.masked_noise:
-                masked = torch.rand(batch_size, generator=generator, device=place) < kind.masked_noise
-                noise = torch.where(masked[:, None, None, None], noise * changed, noise)
-            a = alphas[times][:, None, None, None]
-            noisy = a.sqrt() * edited + (1 - a).sqrt() * noise
-            target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
-            condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=torch.channels_last)
-            kept = base * keep_base if kind.difference else torch.zeros_like(edited)
-            batch = condition, times, tokenize(tokenizer, captions).to(place), target - kept, changed
-
-            def share(modules: torch.nn.ModuleDict, samples: slice, batch: Sequence[torch.Tensor] = batch) -> ShareLoss:
-                return share_loss(modules, kind, half, *(values[samples] for values in batch))
-
-            error = torch.cat(replicas.backward(share, batch_size))
-            torch.nn.utils.clip_grad_norm_(modules.parameters(), 1.0)
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
+            losses = step_of_batch(base, edited, changed, keep_base, tokens)
             step += 1
             follow(average, modules, min(0.998, step / (step + 10)))
-            on_part = (error * changed).sum() / (4 * changed.sum() + 1)
-            smooth = smoothed(smooth, tuple(torch.stack([error.mean(), on_part]).tolist()), 0.98)
+            smooth = losses.clone() if smooth is None else smooth.lerp(losses, 0.02)
             pool.refresh(kind.fresh_pairs)
             if step % LOG_EVERY == 0:
+                on_all, on_part = smooth.tolist()
                 line = {
                     "step": step,
-                    "loss": round(smooth[0], 5),
-                    "loss_part": round(smooth[1], 5),
-                    "rate": rate,
+                    "loss": round(on_all, 5),
+                    "loss_part": round(on_part, 5),
+                    "rate": now,
                     "seconds": round(before + time.time() - started),
                 }
                 files.log(line)
@@ -155,32 +144,3 @@ def train(
         crew.close()
     if stop.name is not None:
         raise Interrupted(f"{stop.name}: stopped after step {step} of {total_steps}; the same command goes on")
-
-
-def share_loss(
-    modules: torch.nn.ModuleDict,
-    kind: Kind,
-    half: bool,
-    condition: torch.Tensor,
-    times: torch.Tensor,
-    tokens: torch.Tensor,
-    wanted: torch.Tensor,
-    changed: torch.Tensor,
-) -> ShareLoss:
-    """Mean loss of some samples, and the errors' squares (N, 4, H, W), detached."""
-    with torch.autocast(condition.device.type, torch.bfloat16, enabled=half):
-        words = modules["text_encoder"](tokens).last_hidden_state
-        away = modules["unet"](condition, times, words).sample.float() - wanted
-    error = squared_error(away, kind.tint_weight)
-    loss = (error * (1 + kind.part_weight * changed)).mean()
-    if kind.copy_weight:
-        loss = loss + kind.copy_weight * (away.abs() * (1 - changed)).mean()
-    return loss, error.detach()
-
-
-def squared_error(difference: torch.Tensor, tint_weight: float) -> torch.Tensor:
-    """Squares of differences (N, 4, H, W); those of the first three channels from their mean count again, weighted."""
-    if not tint_weight:
-        return difference.square()
-    tint = difference[:, :3] - difference[:, :3].mean(1, keepdim=True)
-    return torch.cat([difference[:, :3].square() + tint_weight * tint.square(), difference[:, 3:].square()], dim=1)

@@ -49,8 +49,7 @@ def follow(average: dict[str, torch.Tensor], module: torch.nn.Module, decay: flo
     """Move the averaged weights towards the module's, in place: average = decay average + (1 - decay) weights."""
     with torch.no_grad():
         current = module.state_dict()
-        for key, value in average.items():
-            value.lerp_(current[key], 1 - decay)
+        torch._foreach_lerp_(list(average.values()), [current[key] for key in average], 1 - decay)
 
 
 def smoothed(before: tuple[float, ...] | None, now: tuple[float, ...], keep: float) -> tuple[float, ...]:
