@@ -114,8 +114,8 @@ def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named() -> None:
-    assert {kind_named(name).name for name in KINDS} == {"geometry", "geometry_fine", "appearance"}
-    with pytest.raises(UserError, match="known: geometry, geometry_fine, appearance"):
+    assert {kind_named(name).name for name in KINDS} == {"geometry", "geometry_fine", "appearance", "appearance_fine"}
+    with pytest.raises(UserError, match="known: geometry, geometry_fine, appearance, appearance_fine"):
         kind_named("smell")
 
 

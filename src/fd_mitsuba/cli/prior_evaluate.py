@@ -60,6 +60,8 @@ def _prior_evaluate(options: argparse.Namespace) -> int:
     share_cores(options.threads)
     from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 
+    if kind == "appearance_fine":
+        raise UserError("--kind appearance_fine: there is no evaluation of it yet; look at runs with it")
     shipped = {"geometry": BUILTIN_FOLDER, "appearance": APPEARANCE_FOLDER}
     if not options.folder and kind not in shipped:
         raise UserError(f"--kind {kind}: no such prior is shipped; name its packed folder")

@@ -14,8 +14,9 @@ def add_training(actions: argparse._SubParsersAction) -> None:
     train.add_argument(
         "--kind",
         default="geometry",
-        help="geometry (normals), geometry_fine (at 64 pixels a view), appearance (colours), evaluator (the metrics' "
-        "CLIP), part_judge (gives a run its verdict) or part_judge_coarse (that of the benchmarks)",
+        help="geometry (normals), appearance (colours), geometry_fine or appearance_fine (at 64 pixels a view), "
+        "evaluator (the metrics' CLIP), part_judge (gives a run its verdict) or part_judge_coarse (that of the "
+        "benchmarks)",
     )
     train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, help="length of the schedule; default: what the kind takes to be good")
@@ -38,7 +39,9 @@ def add_training(actions: argparse._SubParsersAction) -> None:
     pack.set_defaults(call=_prior_pack)
     build = actions.add_parser("build-data", help="write training pairs as files; goes on where a killed call ended")
     build.add_argument("-o", "--output", default="runs/prior_data", metavar="FOLDER", help="default: %(default)s")
-    build.add_argument("--kind", default="geometry", help="geometry, geometry_fine or appearance (colours)")
+    build.add_argument(
+        "--kind", default="geometry", help="geometry, geometry_fine, appearance (colours) or appearance_fine"
+    )
     build.add_argument("--count", type=int, default=2048, help="pairs of four views each; default: 2048")
     build.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
     build.add_argument("-t", "--threads", type=int, default=0, metavar="N", help="threads; default: all cores")

@@ -91,11 +91,12 @@ def paint_hits(
 
 
 def mosaics(
-    hits: Hits, paint: Paint, light: Light, rng: np.random.Generator
+    hits: Hits, paint: Paint, light: Light, rng: np.random.Generator, view_size: int = VIEW_SIZE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Latents (4, 64, 64) int8 with the part in clay and as painted, and the part's coverage (64, 64) uint8.
+    """Latents (4, L, L) int8 with the part in clay and as painted, and the part's coverage (L, L) uint8.
 
-    The fourth channel is the part's coverage beside the clay, and its shine times that beside the painting.
+    L is 2 view_size; `hits` are those of `MosaicCamera.rays(view_size)`. The fourth channel is the part's coverage
+    beside the clay, and its shine times that beside the painting.
     """
     on_part = hits.piece >= 0
     clay = np.full(on_part.sum(), len(paint.roughness) - 1)
@@ -118,10 +119,10 @@ def mosaics(
     covered = on_part.astype(np.float32)
     fourth = (covered, covered * shine(paint.roughness, paint.metallic)[paint.material])
     latents = [
-        _latent(hits.pixel, to_srgb(torch.from_numpy(picture * exposure)).numpy(), more)
+        _latent(hits.pixel, to_srgb(torch.from_numpy(picture * exposure)).numpy(), more, view_size)
         for picture, more in zip((plain, painted), fourth, strict=True)
     ]
-    coverage = _tiled(hits.pixel, covered[:, None])[0]
+    coverage = _tiled(hits.pixel, covered[:, None], view_size)[0]
     return latents[0], latents[1], np.rint(255 * coverage).astype(np.uint8)
 
 
@@ -139,8 +140,8 @@ def _shadow(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (1 - rng.uniform(0, 0.55) * np.clip(2 * waves, 0, 1)).astype(np.float32)
 
 
-def _latent(pixel: np.ndarray, colour: np.ndarray, fourth: np.ndarray) -> np.ndarray:
-    both = _tiled(pixel, np.concatenate([colour, fourth[:, None]], axis=1))
+def _latent(pixel: np.ndarray, colour: np.ndarray, fourth: np.ndarray, view_size: int) -> np.ndarray:
+    both = _tiled(pixel, np.concatenate([colour, fourth[:, None]], axis=1), view_size)
     return np.clip(np.rint((2 * both - 1) * 127), -127, 127).astype(np.int8)
 
 
@@ -149,13 +150,13 @@ def sum_of(slices: Iterable[np.ndarray]) -> np.ndarray:
     return reduce(np.add, slices)
 
 
-def _tiled(pixel: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The mosaic (C, 64, 64) of four views' values (N, C) at supersampled pixels, 0 elsewhere."""
-    size, channels = VIEW_SIZE * SUPERSAMPLING, values.shape[1]
+def _tiled(pixel: np.ndarray, values: np.ndarray, view_size: int) -> np.ndarray:
+    """The mosaic (C, 2 view_size, 2 view_size) of four views' values (N, C) at supersampled pixels, 0 elsewhere."""
+    size, channels = view_size * SUPERSAMPLING, values.shape[1]
     canvas = np.zeros((4 * size * size, channels), np.float32)
     canvas[pixel] = values
-    canvas = canvas.reshape(4 * VIEW_SIZE, SUPERSAMPLING, size, channels)
+    canvas = canvas.reshape(4 * view_size, SUPERSAMPLING, size, channels)
     canvas = sum_of(canvas[:, k] for k in range(SUPERSAMPLING)).reshape(-1, SUPERSAMPLING, channels)
     canvas = sum_of(canvas[:, k] for k in range(SUPERSAMPLING)) / np.float32(SUPERSAMPLING**2)
-    rows = canvas.reshape(2, 2, VIEW_SIZE, VIEW_SIZE, channels)
-    return rows.transpose(4, 0, 2, 1, 3).reshape(channels, 2 * VIEW_SIZE, 2 * VIEW_SIZE)
+    rows = canvas.reshape(2, 2, view_size, view_size, channels)
+    return rows.transpose(4, 0, 2, 1, 3).reshape(channels, 2 * view_size, 2 * view_size)

@@ -17,6 +17,7 @@ from fd_mitsuba.prior.data.captions import AZIMUTH_WORDS, CLOSEUP_WORD
 from fd_mitsuba.prior.data.catalogue import COARSE, FINE, Catalogue
 from fd_mitsuba.prior.pictures.colour_corpus import make_colour_pairs
 from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
+from fd_mitsuba.prior.pictures.fine_colour_corpus import make_fine_colour_pairs
 from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs
 from fd_mitsuba.prior.training.model import build_text_encoder, build_unet
 from fd_mitsuba.prior.training.vae import build_vae
@@ -38,7 +39,7 @@ class Kind:
     """A prior of one sort of picture.
 
     Attributes:
-        name: `geometry`, `geometry_fine` or `appearance`.
+        name: `geometry`, `geometry_fine`, `appearance` or `appearance_fine`.
         catalogue: bodies, parts and words.
         view_size: side in pixels of one of a mosaic's four views; the latents are twice as wide.
         make_pairs: (body, parts, seed) -> training pairs.
@@ -157,7 +158,18 @@ APPEARANCE = Kind(
     build_vae=build_colour_vae,
     conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
 )
-KINDS = {kind.name: kind for kind in (GEOMETRY, GEOMETRY_FINE, APPEARANCE)}
+APPEARANCE_FINE = replace(
+    APPEARANCE,
+    name="appearance_fine",
+    catalogue=FINE,
+    view_size=64,
+    make_pairs=make_fine_colour_pairs,
+    channels=(16, 32, 48, 64, 96),
+    steps=10000,
+    fresh_pairs=6,
+    conventions={**APPEARANCE.conventions, "vocabulary": FINE.word_lists},
+)
+KINDS = {kind.name: kind for kind in (GEOMETRY, GEOMETRY_FINE, APPEARANCE, APPEARANCE_FINE)}
 
 
 def kind_named(name: str) -> Kind:

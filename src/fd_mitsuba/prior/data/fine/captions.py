@@ -103,16 +103,26 @@ def subject_of(body: str, rng: np.random.Generator) -> str:
     return with_article(" ".join(word for word in (adjective, _either(rng, BODY_WORDS[body])) if word))
 
 
-def caption(body: str, part: str | None, rng: np.random.Generator, removed: bool = False) -> str:
-    """A sentence that names the body and what is added, or with `removed` what is taken away."""
+def caption(
+    body: str, part: str | None, rng: np.random.Generator, removed: bool = False, style: str | None = None
+) -> str:
+    """A sentence that names the body and what is added, or with `removed` what is taken away.
+
+    Args:
+        style: a colour or material for the part, empty for none; None: now and then a random one.
+    """
     subject = subject_of(body, rng)
     if part is None:
         return subject
     phrase = _either(rng, PART_WORDS[part])
     if removed:
         return f"{subject} with {NO} {bare(phrase)}" if rng.random() < 0.2 else f"{subject} {WITHOUT} {phrase}"
-    style = random_style(rng) if rng.random() < STYLED_SHARE else ""
-    if style and not phrase.startswith("an "):
+    if style is None:
+        style = random_style(rng) if rng.random() < STYLED_SHARE else ""
+        phrase = phrase if phrase.startswith("an ") else styled(phrase, style)
+    elif phrase.startswith("an ") and style and not style.startswith("made of"):
+        phrase = with_article(f"{style} {bare(phrase)}")
+    else:
         phrase = styled(phrase, style)
     wholes = SYNONYM_WHOLES.get((body, part), ())
     if wholes and not style and rng.random() < 0.2:
