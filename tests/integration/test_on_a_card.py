@@ -93,3 +93,25 @@ def test_a_run_on_the_card_ends_as_one_on_the_cpu(tmp_path: Path) -> None:
         assert result.returncode == 0, result.stderr
         volumes[name] = json.loads((out / "metrics.json").read_text())["part_volume"]
     assert volumes["card"] == pytest.approx(volumes["cpu"], rel=0.05)
+
+
+def test_a_recorded_step_of_a_training_does_what_plain_ones_do() -> None:
+    from fd_mitsuba.prior.training.kinds import GEOMETRY
+    from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer, tokenize
+    from fd_mitsuba.prior.training.recorded_step import RecordedStep
+    from fd_mitsuba.prior.training.step import TrainingStep
+
+    tokenizer = build_tokenizer()
+    tokens = tokenize(tokenizer, ["a cat with a crown", "a horse with wings"]).cuda()
+    base = 2 * torch.rand(2, 4, 64, 64, generator=torch.Generator().manual_seed(1)).cuda() - 1
+    batch = base, base.flip(0), (base[:, :1] > 0).float(), torch.ones(2, 1, 1, 1, device="cuda"), tokens
+    losses = []
+    for recorded in (False, True):
+        torch.manual_seed(0)
+        modules = GEOMETRY.build_modules(tokenizer).cuda()
+        rate = torch.tensor(1e-3, device="cuda")
+        optimiser = torch.optim.AdamW(modules.parameters(), lr=rate, fused=True, capturable=True)
+        plain = TrainingStep(modules, optimiser, GEOMETRY, build_scheduler(GEOMETRY.prediction), False, 0)
+        step = RecordedStep(plain, plain.generator) if recorded else plain
+        losses.append(torch.stack([step(*batch).clone() for _ in range(8)]).cpu())
+    torch.testing.assert_close(losses[1], losses[0], rtol=0.02, atol=1e-4)

@@ -26,7 +26,8 @@ def add_evaluate(actions: argparse._SubParsersAction) -> None:
     evaluate.add_argument(
         "--kind",
         default="geometry",
-        help="geometry (default), geometry_fine, appearance, evaluator, part_judge or part_judge_coarse",
+        help="geometry (default), geometry_fine, appearance, appearance_fine, evaluator, part_judge or "
+        "part_judge_coarse",
     )
     evaluate.add_argument("-o", "--output", metavar="FILE", help="PNG; the metrics go into a .json beside it")
     evaluate.add_argument(
@@ -56,18 +57,17 @@ def _prior_evaluate(options: argparse.Namespace) -> int:
     from fd_mitsuba.backend.threads import share_cores
     from fd_mitsuba.prior.training.kinds import kind_named
 
-    kind = kind_named(options.kind).name
+    kind = kind_named(options.kind)
     share_cores(options.threads)
     from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
 
-    if kind == "appearance_fine":
-        raise UserError("--kind appearance_fine: there is no evaluation of it yet; look at runs with it")
     shipped = {"geometry": BUILTIN_FOLDER, "appearance": APPEARANCE_FOLDER}
-    if not options.folder and kind not in shipped:
-        raise UserError(f"--kind {kind}: no such prior is shipped; name its packed folder")
-    folder = Path(options.folder) if options.folder else builtin_folder(shipped[kind])
-    output = Path(options.output or f"runs/prior_{kind}.png").with_suffix(".png")
-    (_evaluate_colours if kind == "appearance" else _evaluate_shapes)(options, folder, output)
+    if not options.folder and kind.name not in shipped:
+        raise UserError(f"--kind {kind.name}: no such prior is shipped; name its packed folder")
+    folder = Path(options.folder) if options.folder else builtin_folder(shipped[kind.name])
+    output = Path(options.output or f"runs/prior_{kind.name}.png").with_suffix(".png")
+    of_colours = kind.name.startswith("appearance")
+    (_evaluate_colours if of_colours else _evaluate_shapes)(options, folder, output)
     print(f"{output}, {output.with_suffix('.json')}")
     return 0
 
@@ -148,9 +148,17 @@ def _evaluate_shapes(options: argparse.Namespace, folder: Path, output: Path) ->
 
 def _evaluate_colours(options: argparse.Namespace, folder: Path, output: Path) -> None:
     from fd_mitsuba.prior.judging.evaluate_paint import evaluate_paint
+    from fd_mitsuba.prior.training.kinds import kind_named
 
     report = evaluate_paint(
-        folder, output, options.count, options.seed, options.steps, painted=options.paint, say=remark
+        folder,
+        output,
+        options.count,
+        options.seed,
+        options.steps,
+        painted=options.paint,
+        say=remark,
+        kind=kind_named(options.kind),
     )
     for name in ("sampled", "painted"):
         row = report[name]

@@ -13,15 +13,17 @@ from PIL import Image
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance.diffusion import MASK_THRESHOLD, DiffusionGuidance
-from fd_mitsuba.prior.data.bodies import BODIES
-from fd_mitsuba.prior.data.captions import BODY_WORDS, MATERIALS, PART_WORDS, styled, view_words
+from fd_mitsuba.prior.data.captions import MATERIALS, styled, view_words
 from fd_mitsuba.prior.data.looks import NAMED, cielab
 from fd_mitsuba.prior.judging.evaluate import UNSEEN_SEED, draw_samples
 from fd_mitsuba.prior.pictures.colour_corpus import PartView, part_views
+from fd_mitsuba.prior.pictures.fine_colour_corpus import fine_part_views
 from fd_mitsuba.prior.pictures.light import Light, lit_by, random_environment
+from fd_mitsuba.prior.training.kinds import APPEARANCE, APPEARANCE_FINE, Kind
 
 _ON_PART = 128
 """Pixels that the part covers by half or more (of 255) are counted."""
+_VIEWS = {APPEARANCE.name: part_views, APPEARANCE_FINE.name: fine_part_views}
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ def evaluate_colours(
     seed: int = 0,
     steps: int = 12,
     scale: float = 1.5,
+    kind: Kind = APPEARANCE,
 ) -> list[ColourFigure]:
     """Write `output` (a row each of clay, truth, sample for twelve cases) and measure.
 
@@ -52,6 +55,7 @@ def evaluate_colours(
         folder: a packed pipeline folder of the appearance prior.
         cases: (body, part, style); a style is a key of `NAMED`.
         steps, scale: of DDIM, and of the text guidance.
+        kind: of colours, whose bodies and parts the cases name.
     """
     guidance = DiffusionGuidance.load(
         GuidanceConfig(model=str(folder), views_per_call=16), appearance=AppearanceConfig()
@@ -60,13 +64,13 @@ def evaluate_colours(
     for number, (body, part, style) in enumerate(cases):
         rng = np.random.default_rng([UNSEEN_SEED, seed, number])
         light = lit_by(random_environment(rng))
-        views = list(part_views(body, [part], rng))
+        views = list(_VIEWS[kind.name](body, [part], rng))
         view = views[number % len(views)]
         painted = {name: _painted(view, name, light, number) for name in NAMED}
         clay.append(painted[style][0])
         truths.append({name: picture[1] for name, picture in painted.items()})
         coverages.append(painted[style][2])
-        captions.append(f"{prompt(body, part, style)}, {view_words(view.camera.azimuth_deg, view.closeup)}")
+        captions.append(f"{prompt(body, part, style, kind)}, {view_words(view.camera.azimuth_deg, view.closeup)}")
     base = torch.from_numpy(np.stack(clay)).float() / 127
     # As the guidance works: noise on the part alone.
     mask = torch.from_numpy(np.stack(coverages)[:, None] > 255 * MASK_THRESHOLD).float()
@@ -88,10 +92,11 @@ def evaluate_colours(
     return figures
 
 
-def prompt(body: str, part: str, style: str) -> str:
+def prompt(body: str, part: str, style: str, kind: Kind = APPEARANCE) -> str:
     """The plainest sentence for a body with a part in a style."""
     word = MATERIALS[style][0] if style in MATERIALS else style
-    return f"a {BODY_WORDS[body][0]} with {styled(PART_WORDS[part][0], word)}"
+    subject = kind.catalogue.body_words[body][0]
+    return f"{'an' if subject[0] in 'aeiou' else 'a'} {subject} with {styled(kind.catalogue.part_words[part][0], word)}"
 
 
 def colours(latent: np.ndarray) -> np.ndarray:
@@ -100,12 +105,12 @@ def colours(latent: np.ndarray) -> np.ndarray:
 
 
 def write_sheet(output: Path, rows: list[list[np.ndarray]], columns: int = 12, zoom: int = 2) -> None:
-    """Write latents (4, 64, 64) as pictures, the rows under each other, `columns` to a line."""
+    """Write latents (4, L, L) as pictures, the rows under each other, `columns` to a line."""
     lines = []
     for start in range(0, len(rows[0]), columns):
         for row in rows:
             pictures = [colours(latent) for latent in row[start : start + columns]]
-            pictures += [np.zeros((64, 64, 3))] * (columns - len(pictures))
+            pictures += [np.zeros_like(pictures[0])] * (columns - len(pictures))
             lines.append(np.concatenate(pictures, axis=1))
     sheet = Image.fromarray(np.rint(255 * np.concatenate(lines)).astype(np.uint8))
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -120,9 +125,18 @@ def _mean_lab(latent: np.ndarray, where: np.ndarray) -> np.ndarray:
     return cielab(colours(latent)[where].mean(0))
 
 
-def balanced_cases(count: int, seed: int = 0) -> list[tuple[str, str, str]]:
-    """`count` cases in which all styles, parts and bodies come about equally often."""
-    rng = np.random.default_rng(seed)
-    lists = [[str(name) for _ in range(-(-count // len(names))) for name in rng.permutation(list(names))]
-             for names in (BODIES, PART_WORDS, NAMED)]  # fmt: skip
-    return list(zip(*(names[:count] for names in lists), strict=True))
+def balanced_cases(count: int, seed: int = 0, kind: Kind = APPEARANCE) -> list[tuple[str, str, str]]:
+    """`count` cases in which all styles, parts and bodies come about equally often, parts on bodies that suit."""
+    rng, catalogue = np.random.default_rng(seed), kind.catalogue
+    bodies, parts, styles = (
+        [str(name) for _ in range(-(-count // len(names))) for name in rng.permutation(list(names))][:count]
+        for names in (catalogue.body_weights, catalogue.part_weights, NAMED)
+    )
+    for k, part in enumerate(parts):
+        wanted = next((j for j in range(k, count) if catalogue.suits(bodies[j], part)), None)
+        if wanted is None:
+            fitting = [body for body in catalogue.body_weights if catalogue.suits(body, part)]
+            bodies[k] = str(rng.choice(fitting))
+        else:
+            bodies[k], bodies[wanted] = bodies[wanted], bodies[k]
+    return list(zip(bodies, parts, styles, strict=True))

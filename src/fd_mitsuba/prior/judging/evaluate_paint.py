@@ -19,6 +19,7 @@ from fd_mitsuba.prior.data.captions import COLOURS
 from fd_mitsuba.prior.data.looks import NAMED
 from fd_mitsuba.prior.judging.evaluate_colour import balanced_cases, evaluate_colours, prompt
 from fd_mitsuba.prior.judging.paint_check import Painted, paint
+from fd_mitsuba.prior.training.kinds import APPEARANCE, Kind
 from fd_mitsuba.scene.bsdf_reading import PlainMaterial
 
 Case = tuple[str, str, str]
@@ -38,6 +39,7 @@ def evaluate_paint(
     painted: int = 0,
     paint_steps: int = 50,
     say: Callable[[str], None] = lambda line: None,
+    kind: Kind = APPEARANCE,
 ) -> dict:
     """Sample `count` (part, colour or material) prompts, paint the first `painted` of them, and judge the colours.
 
@@ -48,13 +50,14 @@ def evaluate_paint(
         folder: a packed pipeline folder of the appearance prior.
         steps: of DDIM.
         paint_steps: of the texture field's descent through the guidance.
+        kind: of colours, whose bodies and parts are asked for.
 
     Returns:
         What the JSON file holds: shares of nearest anchors in CIELAB for colours, materials and both, how metallic and
         how rough painted materials became, and the figure of every prompt.
     """
-    cases = balanced_cases(count, seed)
-    figures = evaluate_colours(folder, output, cases, seed, steps)
+    cases = balanced_cases(count, seed, kind)
+    figures = evaluate_colours(folder, output, cases, seed, steps, kind=kind)
     report: dict = {
         "conditions": {"folder": str(folder), "seed": seed, "steps": steps, "paint_steps": paint_steps},
         "sampled": nearest_shares([(figure.style, figure.nearest) for figure in figures]),
@@ -68,9 +71,9 @@ def evaluate_paint(
     guidance = DiffusionGuidance.load(settings, appearance=PAINT_SETTINGS) if painted else None
     for case in cases[:painted]:
         assert guidance is not None
-        result = paint(guidance, case[0], case[1], prompt(*case), _PAINT_SEED + seed, paint_steps)
+        result = paint(guidance, case[0], case[1], prompt(*case, kind), _PAINT_SEED + seed, paint_steps, kind=kind)
         done.append((case, result))
-        say(f"{prompt(*case)}: nearest to {result.nearest}, metallic {result.metallic:.2f}")
+        say(f"{prompt(*case, kind)}: nearest to {result.nearest}, metallic {result.metallic:.2f}")
         report["painted"] = painted_figures(done)
         report["paintings"].append(_row(case, result))
         write_atomically(path, (json.dumps(report, indent=1) + "\n").encode())

@@ -18,22 +18,18 @@ from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceViews
-from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.looks import CLAY, NAMED, Pattern, cielab, random_body_look
-from fd_mitsuba.prior.data.parts import PARTS
 from fd_mitsuba.prior.pictures.colour_picture import LUMINANCE, visible
 from fd_mitsuba.prior.pictures.corpus import (
     SUPERSAMPLING,
-    VIEW_SIZE,
     MosaicCamera,
     RayCaster,
     closeup_camera,
     global_camera,
 )
 from fd_mitsuba.prior.pictures.light import DIELECTRIC_F0, lit_by, lobes, random_environment, reflected
+from fd_mitsuba.prior.training.kinds import APPEARANCE, Kind
 from fd_mitsuba.render.tonemap import CLAY_LEVEL, to_srgb
-
-_SIZE = VIEW_SIZE * SUPERSAMPLING
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class Painted:
     """Mean of the part after painting: sRGB as seen, the anchor it is nearest to in CIELAB under the same light, and
     the field's base colour (sRGB), roughness and metallic; `speckle` is the base colour's standard deviation in CIELAB.
 
-    `pictures` are mosaics (3, 128, 128) of one view: clay, then after each quarter of the steps.
+    `pictures` are mosaics (3, 2 H, 2 H) of one view, H pixels a side: clay, then after each quarter of the steps.
     """
 
     seen: tuple[float, ...]
@@ -56,10 +52,13 @@ class Painted:
 class Easel:
     """One body with one part under one light, and the texture field that is painted on the part."""
 
-    def __init__(self, body: str, part: str, seed: int, texture: TextureConfig | None = None) -> None:
+    def __init__(
+        self, body: str, part: str, seed: int, texture: TextureConfig | None = None, kind: Kind = APPEARANCE
+    ) -> None:
         rng = np.random.default_rng([seed, 77])
-        made = BODIES[body](rng)
-        self.solid = PARTS[part](made, rng)
+        made = kind.catalogue.make_body(body, rng)
+        self.solid = kind.catalogue.grow(made, part, rng).solid
+        self._view_size = kind.view_size
         self._casters = RayCaster(made.solid), RayCaster(self.solid)
         self._light = lit_by(random_environment(rng))
         self._look = Pattern(random_body_look(rng, None)[0], 1.8, rng)
@@ -77,13 +76,14 @@ class Easel:
         self._exposure = CLAY_LEVEL / float(np.quantile(light @ LUMINANCE, 0.95))
 
     def _sight(self, camera: MosaicCamera) -> tuple:
-        rays = camera.rays()[:2]
+        rays = camera.rays(self._view_size)[:2]
         return rays, self._casters[0].cast(*rays), self._casters[1], self._pieces
 
     def view(self, camera: MosaicCamera) -> EaselView:
         hits = visible(*self._sight(camera))
         on_part = hits.piece >= 0
-        base, zone = np.zeros((4 * _SIZE * _SIZE, 3), np.float32), np.zeros(len(hits.pixel), np.int64)
+        size = self._view_size * SUPERSAMPLING
+        base, zone = np.zeros((4 * size * size, 3), np.float32), np.zeros(len(hits.pixel), np.int64)
         colour = self._look.colour(hits.point[~on_part])
         rough, metal = (np.array([v], np.float32) for v in (self._look.roughness, self._look.material.metallic))
         base[hits.pixel[~on_part]] = reflected(
@@ -101,12 +101,13 @@ class Easel:
             torch.from_numpy(hits.pixel[on_part]),
             torch.from_numpy(hits.point[on_part]),
             *(tuple(torch.from_numpy(term * self._exposure) for term in three) for three in terms),
+            size=size,
         )
 
 
 @dataclass(frozen=True)
 class EaselView:
-    """Supersampled pixels of four views; `terms` as `light.lobes`, for the field's and for the clay's roughness."""
+    """Supersampled pixels of four views, `size` a side; `terms` as `light.lobes`, for roughness of field and clay."""
 
     base: Tensor
     pixel_is_base: Tensor
@@ -114,6 +115,7 @@ class EaselView:
     points: Tensor
     terms: tuple[Tensor, ...]
     clay_terms: tuple[Tensor, ...]
+    size: int
 
     def picture(self, base_color: Tensor, metallic: Tensor, clay: bool = False) -> Tensor:
         """sRGB (4, 3, H, H) in [0, 1]. Gradients flow to the material (N, 3), (N, 1) of the part's pixels."""
@@ -121,30 +123,37 @@ class EaselView:
         f0 = DIELECTRIC_F0 * (1 - metallic) + base_color * metallic
         radiance = base_color * (1 - metallic) * diffuse + f0 * tinted + white
         flat = self.base.index_copy(0, self.part_pixel, radiance)
-        return to_srgb(flat).reshape(4, _SIZE, _SIZE, 3).permute(0, 3, 1, 2)
+        return to_srgb(flat).reshape(4, self.size, self.size, 3).permute(0, 3, 1, 2)
 
     def clay(self) -> Tensor:
         count = len(self.points)
         return self.picture(torch.full((count, 3), CLAY.grey), torch.zeros(count, 1), clay=True)
 
     def part_mask(self) -> Tensor:
-        flat = torch.zeros(4 * _SIZE * _SIZE).index_fill(0, self.part_pixel, 1.0)
-        return flat.reshape(4, 1, _SIZE, _SIZE)
+        flat = torch.zeros(4 * self.size * self.size).index_fill(0, self.part_pixel, 1.0)
+        return flat.reshape(4, 1, self.size, self.size)
 
     def shine(self, roughness: Tensor, metallic: Tensor) -> Tensor:
-        flat = torch.zeros(4 * _SIZE * _SIZE).index_copy(0, self.part_pixel, shine(roughness, metallic)[:, 0])
-        return flat.reshape(4, 1, _SIZE, _SIZE)
+        flat = torch.zeros(4 * self.size * self.size).index_copy(0, self.part_pixel, shine(roughness, metallic)[:, 0])
+        return flat.reshape(4, 1, self.size, self.size)
 
     def mask(self) -> Tensor:
         flat = self.part_mask().flatten().index_fill(0, self.pixel_is_base, 1.0)
-        return flat.reshape(4, 1, _SIZE, _SIZE)
+        return flat.reshape(4, 1, self.size, self.size)
 
 
 def paint(
-    guidance: DiffusionGuidance, body: str, part: str, prompt: str, seed: int, steps: int, learning_rate: float = 0.01
+    guidance: DiffusionGuidance,
+    body: str,
+    part: str,
+    prompt: str,
+    seed: int,
+    steps: int,
+    learning_rate: float = 0.01,
+    kind: Kind = APPEARANCE,
 ) -> Painted:
     """Paint a part by `guide_appearance`, half of the steps close up, and look at the result."""
-    easel = Easel(body, part, seed)
+    easel = Easel(body, part, seed, kind=kind)
     guidance.set_prompt(prompt)
     optimiser = torch.optim.AdamW(easel.field.parameters(), lr=learning_rate, betas=(0.9, 0.99), eps=1e-15)
     fixed = easel.view(easel.camera)

@@ -15,7 +15,7 @@ from fd_mitsuba.prior.training.kinds import GEOMETRY, Kind
 from fd_mitsuba.prior.training.model import TokenRows, build_scheduler, build_tokenizer
 from fd_mitsuba.prior.training.pool import Pairs, Pool, WorkerPool
 from fd_mitsuba.prior.training.recorded_step import RecordedStep
-from fd_mitsuba.prior.training.step import TrainingStep
+from fd_mitsuba.prior.training.step import TrainingStep, memory_format
 from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow
 from fd_mitsuba.prior.training.warm_start import load_start
 from fd_mitsuba.training.stop_request import stop_on_signals
@@ -62,7 +62,7 @@ def train(
         load_start(init, modules, tokenizer, kind.prediction)
     modules.to(place)
     unet: Any = modules["unet"]
-    unet.to(memory_format=torch.channels_last)
+    unet.to(memory_format=memory_format(place))
     average = {k: v.clone() for k, v in modules.state_dict().items() if v.is_floating_point()}
     on_card = place.type == "cuda"
     # A recorded step reads its rate from the card.
@@ -125,7 +125,9 @@ def train(
             losses = step_of_batch(base, edited, changed, keep_base, tokens)
             step += 1
             follow(average, modules, min(0.998, step / (step + 10)))
-            smooth = losses.clone() if smooth is None else smooth.lerp(losses, 0.02)
+            smooth = (
+                losses.clone() if smooth is None else torch.where(losses.isfinite(), smooth.lerp(losses, 0.02), smooth)
+            )
             pool.refresh(kind.fresh_pairs)
             if step % LOG_EVERY == 0:
                 on_all, on_part = smooth.tolist()

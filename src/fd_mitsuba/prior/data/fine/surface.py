@@ -64,8 +64,8 @@ class Surface:
         angle = np.arange(16) * (np.pi / 8)
         origins = top + np.stack([radius * np.sin(angle), np.full(16, 1.2), radius * np.cos(angle)], 1)
         points, hit = self.cast(origins, np.array([0, -1.0, 0]))
-        height = np.where(hit, points[:, 1], -np.inf)
         lowest = top[1] - 0.55 * self.size
+        height = np.where(hit, points[:, 1], lowest)
         return np.array([top[0], float(np.clip(np.quantile(height, 0.7), lowest, top[1])), top[2]])
 
     def neck(self) -> tuple[np.ndarray, np.ndarray, float]:
