@@ -49,6 +49,7 @@ def test_the_appearance_prior_trains_with_its_own_pictures(tmp_path: Path) -> No
     pack(tmp_path / "run" / "checkpoint.pt", tmp_path / "packed")
     text = (builtin_folder(tmp_path / "packed") / "fd_mitsuba.json").read_text()
     assert '"condition": "clay"' in text and "normal_space" not in text
+    assert '"sample_size": 32' in (tmp_path / "packed" / "unet" / "config.json").read_text()  # small steps alone
     assert sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*")) < 10e6
     with pytest.raises(UserError, match="--kind appearance"):
         train(tmp_path / "run", seconds=600, batch_size=2, total_steps=2)

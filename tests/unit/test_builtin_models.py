@@ -11,8 +11,13 @@ from conftest import INTEGRATOR
 from fd_mitsuba.config import settings_for_run
 from fd_mitsuba.config.for_model import is_builtin, is_small_prior
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, FINE_FOLDER, shipped_folder
-from fd_mitsuba.guidance.known_colours import material_left_out
+from fd_mitsuba.guidance.builtin import (
+    APPEARANCE_FOLDER,
+    BUILTIN_FOLDER,
+    FINE_APPEARANCE_FOLDER,
+    FINE_FOLDER,
+    shipped_folder,
+)
 from fd_mitsuba.guidance.loading import locate
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.understood_prompt import understood_prompt
@@ -25,7 +30,8 @@ FINE = "guidance.model=builtin-fine"
 
 def test_names_stand_for_folders() -> None:
     assert [locate(name) for name in ("builtin", "builtin-fine")] == [BUILTIN_FOLDER, FINE_FOLDER]
-    assert [locate(name, appearance=True) for name in ("builtin", "builtin-fine")] == [APPEARANCE_FOLDER] * 2
+    of_colours = [locate(name, appearance=True) for name in ("builtin", "builtin-fine")]
+    assert of_colours == [APPEARANCE_FOLDER, FINE_APPEARANCE_FOLDER]
     assert shipped_folder("a/folder") is None and not is_builtin("a/folder") and is_small_prior("builtin-fine")
 
 
@@ -50,13 +56,13 @@ def test_a_part_that_only_the_fine_one_knows() -> None:
         understood_prompt("a pig with a laptop", coarse)
 
 
-def test_what_the_prior_of_colours_does_not_know_keeps_its_material(make_scene: Callable[..., Path]) -> None:
+@pytest.mark.parametrize("model", ["builtin", "builtin-fine"])
+def test_colours_know_every_word_of_the_shapes_they_go_with(model: str) -> None:
+    shapes, colours = vocabulary_of(model), vocabulary_of(model, appearance=True)
+    assert shapes is not None and shapes == colours
+
+
+def test_a_part_that_only_the_fine_one_knows_gets_its_material_too(make_scene: Callable[..., Path]) -> None:
     scene = load_edit_scene(make_scene(integrator=INTEGRATOR.replace("two wings", "a mushroom cap")))
-    config = settings_for_run(None, [FINE]).config
-    line = material_left_out(scene, config)
-    assert line is not None and "does not know mushroom cap: only the geometry stage runs" in line
-    report = check_scene(scene, config)
-    assert report.refusal is None and line in report.warnings
-    winged = load_edit_scene(make_scene())
-    assert material_left_out(winged, config) is None
-    assert material_left_out(scene, settings_for_run(None, [FINE, "appearance.lambda_sds=0"]).config) is None
+    report = check_scene(scene, settings_for_run(None, [FINE]).config)
+    assert report.refusal is None and report.cost.appearance_seconds_total > 0

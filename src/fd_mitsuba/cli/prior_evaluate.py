@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 
 from fd_mitsuba.cli.options import remark
-from fd_mitsuba.errors import UserError
 
 ROUNDS_OF_BODIES = 3
 """Unseen random bodies of each name on which a judge of parts is measured."""
@@ -59,14 +58,14 @@ def _prior_evaluate(options: argparse.Namespace) -> int:
 
     kind = kind_named(options.kind)
     share_cores(options.threads)
-    from fd_mitsuba.guidance.builtin import APPEARANCE_FOLDER, BUILTIN_FOLDER, builtin_folder
+    from fd_mitsuba.config.for_model import BUILTIN, BUILTIN_FINE
+    from fd_mitsuba.guidance.builtin import builtin_folder, shipped_folder
 
-    shipped = {"geometry": BUILTIN_FOLDER, "appearance": APPEARANCE_FOLDER}
-    if not options.folder and kind.name not in shipped:
-        raise UserError(f"--kind {kind.name}: no such prior is shipped; name its packed folder")
-    folder = Path(options.folder) if options.folder else builtin_folder(shipped[kind.name])
-    output = Path(options.output or f"runs/prior_{kind.name}.png").with_suffix(".png")
     of_colours = kind.name.startswith("appearance")
+    shipped = shipped_folder(BUILTIN_FINE if kind.name.endswith("_fine") else BUILTIN, of_colours)
+    assert shipped is not None
+    folder = Path(options.folder) if options.folder else builtin_folder(shipped)
+    output = Path(options.output or f"runs/prior_{kind.name}.png").with_suffix(".png")
     (_evaluate_colours if of_colours else _evaluate_shapes)(options, folder, output)
     print(f"{output}, {output.with_suffix('.json')}")
     return 0

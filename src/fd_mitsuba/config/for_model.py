@@ -13,7 +13,7 @@ from fd_mitsuba.config.toml_reading import apply_override, read_toml
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"
 BUILTIN, BUILTIN_FINE = "builtin", "builtin-fine"
-"""Names of the priors of shapes that are shipped; either goes with the shipped prior of colours."""
+"""Names of the priors of shapes that are shipped; each goes with a prior of colours of its own."""
 _CONVENTIONS_NAME = "fd_mitsuba.json"
 """A pipeline folder with this file was made by `prior pack`: a small prior, as the built-in one is."""
 

@@ -12,6 +12,7 @@ from fd_mitsuba.errors import UserError
 BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "shapes"
 FINE_FOLDER = BUILTIN_FOLDER.with_name("shapes_fine")
 APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours")
+FINE_APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours_fine")
 SUMS_NAME = "SHA256SUMS"
 
 
@@ -19,11 +20,13 @@ def shipped_folder(model: str, appearance: bool = False) -> Path | None:
     """Where the prior lies that a value of `guidance.model` names; None: it names none that is shipped.
 
     Args:
-        appearance: the prior of colours, which goes with either of the others.
+        appearance: the prior of colours that goes with it: it knows the same words.
     """
     if not is_builtin(model):
         return None
-    return APPEARANCE_FOLDER if appearance else FINE_FOLDER if model == BUILTIN_FINE else BUILTIN_FOLDER
+    if model == BUILTIN_FINE:
+        return FINE_APPEARANCE_FOLDER if appearance else FINE_FOLDER
+    return APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER
 
 
 def builtin_folder(folder: Path = BUILTIN_FOLDER) -> Path:

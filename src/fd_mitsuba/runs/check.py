@@ -7,7 +7,6 @@ import numpy as np
 from fd_mitsuba.config import RunConfig, misfits
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance.known_colours import material_left_out
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading
 from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_part_prompt, understood_prompt
@@ -68,7 +67,6 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
             + _region_warnings(regions, config)
             + _scene_warnings(scene, config)
             + ([cost.memory_warning] if cost.memory_warning else [])
-            + ([without_material] if (without_material := material_left_out(scene, config)) else [])
         ),
         prompt_reading=reading,
         part_readings=part_readings,
@@ -81,7 +79,6 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
 def _prompts(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, dict[str, PromptReading], str | None]:
     """How the guidance models read the scene's prompt and those of parts, and why they would refuse them."""
     by_words = config.appearance.lambda_sds > 0 and scene.has_light and not scene.subtracts
-    by_words = by_words and material_left_out(scene, config) is None
     asked = {False: config.geometry.lambda_sds > 0, True: by_words}
     reading, parts = None, {}
     try:

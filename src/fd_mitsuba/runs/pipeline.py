@@ -23,7 +23,6 @@ from fd_mitsuba.export.final_surface.final_part import FinalPart, final_parts
 from fd_mitsuba.export.part_record import part_record
 from fd_mitsuba.fields.texture import TextureField
 from fd_mitsuba.guidance.interface import Guidance
-from fd_mitsuba.guidance.known_colours import material_left_out
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.appearance_outcome import (
     CUTS_UNKNOWN,
@@ -124,11 +123,6 @@ def run(
             if "geometry" not in stages:
                 raise UserError(f"{scene.path}: {CUTS_UNKNOWN}")
             say(f"{CUTS_UNKNOWN}; so only the geometry stage runs, and the cut takes the base's material")
-            stages = ("geometry",)
-        elif with_assets and not hasattr(guidance, "guide_appearance") and (line := material_left_out(scene, config)):
-            if "geometry" not in stages:
-                raise UserError(f"{scene.path}: {line}")
-            say(line)
             stages = ("geometry",)
         with_geometry = "geometry" in stages and geometry_from is None
         for line in check_folder(scene, config, folder, resume or (not with_geometry and geometry_from is None)):

@@ -98,6 +98,8 @@ def styled(phrase: str, style: str) -> str:
     for article in ("a pair of ", "a row of ", "a ", "one ", "two "):
         if phrase.startswith(article):
             return f"{article}{style} {phrase.removeprefix(article)}"
+    if phrase.startswith("an "):
+        return f"a {style} {phrase.removeprefix('an ')}"
     return f"{style} {phrase}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,6 @@ from fd_mitsuba.prior.training.kinds import APPEARANCE, APPEARANCE_FINE, Kind
 
 _ON_PART = 128
 """Pixels that the part covers by half or more (of 255) are counted."""
-_VIEWS = {APPEARANCE.name: part_views, APPEARANCE_FINE.name: fine_part_views}
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def evaluate_colours(
     for number, (body, part, style) in enumerate(cases):
         rng = np.random.default_rng([UNSEEN_SEED, seed, number])
         light = lit_by(random_environment(rng))
-        views = list(_VIEWS[kind.name](body, [part], rng))
+        views = list(_views(kind, body, part, rng, guidance.appearance_size))
         view = views[number % len(views)]
         painted = {name: _painted(view, name, light, number) for name in NAMED}
         clay.append(painted[style][0])
@@ -115,6 +114,11 @@ def write_sheet(output: Path, rows: list[list[np.ndarray]], columns: int = 12, z
     sheet = Image.fromarray(np.rint(255 * np.concatenate(lines)).astype(np.uint8))
     output.parent.mkdir(parents=True, exist_ok=True)
     sheet.resize((sheet.width * zoom, sheet.height * zoom), Image.Resampling.NEAREST).save(output)
+
+
+def _views(kind: Kind, body: str, part: str, rng: np.random.Generator, size: int) -> Iterator[PartView]:
+    """Views of `size` pixels a side; the coarse prior has one size."""
+    return fine_part_views(body, [part], rng, size) if kind is APPEARANCE_FINE else part_views(body, [part], rng)
 
 
 def _painted(view: PartView, style: str, light: Light, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -53,12 +53,18 @@ class Easel:
     """One body with one part under one light, and the texture field that is painted on the part."""
 
     def __init__(
-        self, body: str, part: str, seed: int, texture: TextureConfig | None = None, kind: Kind = APPEARANCE
+        self,
+        body: str,
+        part: str,
+        seed: int,
+        texture: TextureConfig | None = None,
+        kind: Kind = APPEARANCE,
+        view_size: int = 32,
     ) -> None:
         rng = np.random.default_rng([seed, 77])
         made = kind.catalogue.make_body(body, rng)
         self.solid = kind.catalogue.grow(made, part, rng).solid
-        self._view_size = kind.view_size
+        self._view_size = view_size
         self._casters = RayCaster(made.solid), RayCaster(self.solid)
         self._light = lit_by(random_environment(rng))
         self._look = Pattern(random_body_look(rng, None)[0], 1.8, rng)
@@ -153,7 +159,7 @@ def paint(
     kind: Kind = APPEARANCE,
 ) -> Painted:
     """Paint a part by `guide_appearance`, half of the steps close up, and look at the result."""
-    easel = Easel(body, part, seed, kind=kind)
+    easel = Easel(body, part, seed, kind=kind, view_size=guidance.appearance_size)
     guidance.set_prompt(prompt)
     optimiser = torch.optim.AdamW(easel.field.parameters(), lr=learning_rate, betas=(0.9, 0.99), eps=1e-15)
     fixed = easel.view(easel.camera)

@@ -34,14 +34,20 @@ def make_fine_colour_pairs(body: str, parts: list[str | None], seed: int) -> lis
     return painted_pairs(body, fine_part_views(body, parts, rng), fine_colour_caption, FINE.natural, rng)
 
 
-def fine_part_views(body: str, parts: list[str | None], rng: np.random.Generator) -> Iterator[PartView]:
+def fine_part_views(
+    body: str, parts: list[str | None], rng: np.random.Generator, view_size: int = VIEW_SIZE
+) -> Iterator[PartView]:
     """Two views (global, close) a part of one random body, except those that show less than LEAST_PIXELS of the part.
 
     `None` among the parts, and parts that find no place on the body, give no views.
+
+    Args:
+        view_size: pixels a side; the least number goes with the area.
     """
+    least = LEAST_PIXELS * (SUPERSAMPLING * view_size / VIEW_SIZE) ** 2
     surface = Surface(stretched(BODIES[body](rng), np.diag(random_stretch(rng))))
     overview = global_camera(rng)
-    overview_rays = overview.rays(VIEW_SIZE)[:2]
+    overview_rays = overview.rays(view_size)[:2]
     overview_base = surface.caster.cast(*overview_rays)
     for part in filter(None, parts):
         zones = list(PARTS[part](surface, rng).values())
@@ -51,10 +57,10 @@ def fine_part_views(body: str, parts: list[str | None], rng: np.random.Generator
         # Resizing, moving and bending keep the order of the faces, so zones can go by it, without the closed pieces.
         caster, zone_of_face = RayCaster(solid), np.repeat(np.arange(len(zones)), [len(zone.faces) for zone in zones])
         for camera, closeup in ((overview, False), (closeup_camera(solid, rng), True)):
-            rays = camera.rays(VIEW_SIZE)[:2] if closeup else overview_rays
+            rays = camera.rays(view_size)[:2] if closeup else overview_rays
             hits = visible(rays, surface.caster.cast(*rays) if closeup else overview_base, caster, zone_of_face)
-            if (hits.piece >= 0).sum() >= LEAST_PIXELS * SUPERSAMPLING**2:
-                yield PartView(part, surface.body.solid, solid, camera, closeup, hits, hits.piece, VIEW_SIZE)
+            if (hits.piece >= 0).sum() >= least:
+                yield PartView(part, surface.body.solid, solid, camera, closeup, hits, hits.piece, view_size)
 
 
 def fine_colour_caption(body: str, part: str, rng: np.random.Generator) -> Said:

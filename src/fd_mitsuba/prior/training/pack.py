@@ -18,6 +18,8 @@ from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer
 def pack(checkpoint: Path, folder: Path) -> None:
     """Write the averaged weights of a checkpoint as an InstructPix2Pix-layout pipeline, an evaluator's as a CLIP model.
 
+    A prior whose training was no further than its small steps is written as one of pictures of half the size.
+
     Args:
         checkpoint: `checkpoint.pt` of `training.train.train` or `clip_train.train_evaluator`; it says which kind it is.
         folder: created; existing files are replaced.
@@ -28,7 +30,9 @@ def pack(checkpoint: Path, folder: Path) -> None:
         return
     kind = kind_named(state.get("kind", GEOMETRY.name))
     tokenizer = build_tokenizer(kind.catalogue.vocabulary)
-    modules = kind.build_modules(tokenizer)
+    modules: Any = kind.build_modules(tokenizer)
+    if "step" in state and state["step"] <= state.get("small_steps", 0):  # all that it has seen
+        modules["unet"].register_to_config(sample_size=kind.view_size)
     missing = modules.load_state_dict(state["average"], strict=False).missing_keys
     if any("position_ids" not in key for key in missing):
         raise ValueError(f"{checkpoint}: lacks {missing}")
