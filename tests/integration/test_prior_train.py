@@ -129,3 +129,9 @@ def test_a_signal_ends_the_training_with_what_it_has_learned(tmp_path: Path, mon
     with pytest.raises(Interrupted, match=r"SIGTERM: stopped after step 1 of 4; the same command goes on"):
         train(tmp_path / "run", seconds=600, batch_size=2, total_steps=4)
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1
+
+
+def test_a_training_that_learns_nothing_any_more_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_module, "LOG_EVERY", 2)
+    with pytest.raises(UserError, match="2 steps in a row had a loss that is not finite; start anew with a lower"):
+        train(tmp_path / "run", seconds=600, batch_size=2, total_steps=9, rate=1e30)

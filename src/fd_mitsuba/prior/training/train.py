@@ -51,6 +51,10 @@ def train(
         half: multiply in bfloat16: faster on a processor that has it, slower on others.
         device: where the networks are, as torch names it; noise and times are drawn there.
         workers: processes that render pictures beside the training; 0: it renders them itself, between its steps.
+
+    Raises:
+        UserError: the folder holds another training, or no step learns any more.
+        Interrupted: by a signal; the checkpoint is written.
     """
     total_steps = kind.steps if total_steps is None else total_steps
     files = TrainingFolder(folder)
@@ -99,6 +103,7 @@ def train(
     pool.refresh(min(600, total_steps * batch_size))
     rows = TokenRows(tokenizer)
     started, smooth = time.time(), None
+    skipped, skipped_before = torch.zeros((), dtype=torch.long, device=place), 0
 
     def save() -> None:
         state = {"modules": modules.state_dict(), "optimiser": optimiser.state_dict(), "average": average}
@@ -125,16 +130,23 @@ def train(
             losses = step_of_batch(base, edited, changed, keep_base, tokens)
             step += 1
             follow(average, modules, min(0.998, step / (step + 10)))
-            smooth = (
-                losses.clone() if smooth is None else torch.where(losses.isfinite(), smooth.lerp(losses, 0.02), smooth)
-            )
+            finite = losses.isfinite().all()
+            skipped += ~finite
+            smooth = losses.clone() if smooth is None else torch.where(finite, smooth.lerp(losses, 0.02), smooth)
             pool.refresh(kind.fresh_pairs)
             if step % LOG_EVERY == 0:
-                on_all, on_part = smooth.tolist()
+                on_all, on_part, in_all = *smooth.tolist(), int(skipped)
+                if in_all - skipped_before == LOG_EVERY:
+                    raise UserError(
+                        f"{files.checkpoint}: {LOG_EVERY} steps in a row had a loss that is not finite; "
+                        "start anew with a lower --rate, or without --bf16"
+                    )
+                skipped_before = in_all
                 line = {
                     "step": step,
                     "loss": round(on_all, 5),
                     "loss_part": round(on_part, 5),
+                    "skipped": in_all,
                     "rate": now,
                     "seconds": round(before + time.time() - started),
                 }
