@@ -15,6 +15,7 @@ from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.prior.data import captions as coarse_captions
 from fd_mitsuba.prior.data.body import Body
+from fd_mitsuba.prior.data.captions import styled
 from fd_mitsuba.prior.data.catalogue import FINE
 from fd_mitsuba.prior.data.fine.bodies import BODIES, NAMELESS
 from fd_mitsuba.prior.data.fine.captions import BODY_WORDS, NEUTRAL, PART_WORDS, bare, caption, vocabulary, word_lists
@@ -151,6 +152,9 @@ def test_the_vocabulary_reads_prompts_with_the_new_words() -> None:
     assert read_prompt("a dragon with bat wings", words).bodies == ("dragon",)
     assert "bat wings" in read_prompt("a dragon with bat wings", words).parts
     assert bare("an umbrella") == "umbrella"
+    assert styled("an umbrella", "red") == "a red umbrella"
+    assert styled("an umbrella", "orange") == "an orange umbrella"
+    assert styled("an umbrella", "made of wood") == "an umbrella made of wood"
 
 
 def test_glasses_reach_from_before_the_eyes_to_behind_the_middle_of_the_head() -> None:

@@ -99,7 +99,7 @@ def styled(phrase: str, style: str) -> str:
         if phrase.startswith(article):
             return f"{article}{style} {phrase.removeprefix(article)}"
     if phrase.startswith("an "):
-        return f"a {style} {phrase.removeprefix('an ')}"
+        return f"{'an' if style[0] in 'aeiou' else 'a'} {style} {phrase.removeprefix('an ')}"
     return f"{style} {phrase}"
 
 

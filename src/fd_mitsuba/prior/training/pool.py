@@ -98,11 +98,6 @@ class WorkerPool:
         for process in self._processes:
             process.start()
 
-    @property
-    def made(self) -> int:
-        """Pairs taken in so far."""
-        return self._made
-
     def refresh(self, count: int) -> None:
         """Take in what the workers have made; waits only while there are less than `count` pairs in all.
 

@@ -119,11 +119,7 @@ def caption(
         return f"{subject} with {NO} {bare(phrase)}" if rng.random() < 0.2 else f"{subject} {WITHOUT} {phrase}"
     if style is None:
         style = random_style(rng) if rng.random() < STYLED_SHARE else ""
-        phrase = phrase if phrase.startswith("an ") else styled(phrase, style)
-    elif phrase.startswith("an ") and style and not style.startswith("made of"):
-        phrase = with_article(f"{style} {bare(phrase)}")
-    else:
-        phrase = styled(phrase, style)
+    phrase = styled(phrase, style)
     wholes = SYNONYM_WHOLES.get((body, part), ())
     if wholes and not style and rng.random() < 0.2:
         return with_article(wholes[rng.integers(len(wholes))])
