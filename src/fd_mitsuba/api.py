@@ -58,6 +58,7 @@ def import_asset(
     at: Sequence[str] = (),
     size: str | None = None,
     light: Path | str | None = None,
+    subtract: bool = False,
 ) -> ImportedAsset:
     """Write a scene to edit, with everything that it reads, out of a GLB, glTF, OBJ, DAE, 3DS, PLY, STL, OFF or ZIP.
 
@@ -75,6 +76,7 @@ def import_asset(
         at: places of focal regions; see `scene.region_words`; none: its head.
         size: of the regions: a share of the longest side such as "0.3", or "12u" in the asset's unit.
         light: an EXR environment map; None: a shipped one.
+        subtract: whether the regions take something off, in place of adding a part.
 
     Returns:
         The scene's path, and what was guessed, left out or understood in another way.
@@ -93,7 +95,7 @@ def import_asset(
             raise UserError(f"{name}: is blank; describe the object")
     told = [None if text is None else " ".join(text.split()) for text in (prompt, base_prompt)]
     lit = _LIGHT if light is None else Path(light)
-    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size)
+    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size, subtract)
 
 
 def load_scene(
@@ -109,6 +111,7 @@ def load_scene(
     at: Sequence[str] = (),
     size: str | None = None,
     needs_region: bool = True,
+    subtract: bool = False,
 ) -> EditScene:
     """Read a scene and start Mitsuba if it has not been started.
 
@@ -127,6 +130,7 @@ def load_scene(
             into the run.
         size: of these regions: a share of the base's longest side such as "0.3", or "12u" in the scene's unit.
         needs_region: False: a scene without regions or prompt is taken as well, to look at its base.
+        subtract: whether the regions at `at` take something off, in place of adding a part.
 
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
@@ -143,14 +147,21 @@ def load_scene(
         from fd_mitsuba.scene.load_scene import load_edit_scene
 
         if at:
-            regions = _placed(Path(path), dict(parameters or {}), regions, at, size)
+            regions = _placed(Path(path), dict(parameters or {}), regions, at, size, subtract)
         elif size is not None:
             raise UserError(f"size {size}: is that of regions to place; say where they go, too")
+        elif subtract:
+            raise UserError("subtract: is for regions to place; say where they go, too")
         return load_edit_scene(path, dict(parameters or {}), regions, words, on_misplaced, needs_region)
 
 
 def _placed(
-    scene: Path, parameters: dict[str, str], regions: Path | str | None, at: Sequence[str], size: str | None
+    scene: Path,
+    parameters: dict[str, str],
+    regions: Path | str | None,
+    at: Sequence[str],
+    size: str | None,
+    subtract: bool,
 ) -> Path:
     """A file of regions at places, which is gone with this process."""
     from fd_mitsuba.assets.placing import write_placed_regions
@@ -158,7 +169,7 @@ def _placed(
     if regions is not None:
         raise UserError(f"{regions}: regions come from a file or from places to put them; give one of the two")
     target = temporary_folder() / "regions.xml"
-    write_placed_regions(scene, parameters, at, size, target)
+    write_placed_regions(scene, parameters, at, size, target, subtract)
     return target
 
 

@@ -139,6 +139,21 @@ def test_a_bite_from_scene_to_exports(make_scene: Make, ball: str, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("no_turntable")
+def test_a_cap_above_the_cut_goes_with_it(make_scene: Make, ball: str, tmp_path: Path) -> None:
+    """A flat region cuts a slice out just below the ball's top, whose cap nothing holds any more."""
+    slice_ = region().replace(f'<scale value="{BITE}"/><translate x="5" y="{AWAY}"/>',
+                              '<scale x="2.4" y="0.25" z="2.4"/><translate x="5" y="2.55"/>')  # fmt: skip
+    metrics = run_of(make_scene(base=ball, region=slice_), tmp_path / "run")
+    assert metrics["crumbs"] == 1 and metrics["loose_pieces"] == 0 and metrics["volume_change_error"] < 1e-3
+    for name in ("cut_ball", "assembled", "part_bite"):
+        mesh = trimesh.load(tmp_path / "run" / "export" / f"{name}.ply")
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        assert mesh.is_watertight and mesh.body_count == 1, name
+    top = trimesh.load(tmp_path / "run" / "export" / "assembled.ply").bounds[1, 1]
+    assert top < 2.5
+
+
+@pytest.mark.usefixtures("no_turntable")
 def test_an_analytic_base_is_cut_too(make_scene: Make, tmp_path: Path, mi: Any) -> None:
     base = '<shape type="sphere" id="ball"><point name="center" x="5" y="0" z="0"/>'
     base += '<float name="radius" value="3"/></shape>'

@@ -148,6 +148,11 @@ def test_a_cut_that_a_run_refuses_is_refused(make_scene: Make) -> None:
     scene = load_edit_scene(make_scene(region=cut))
     assert "subtract" in (check_scene(scene, RunConfig()).refusal or "")
     assert check_scene(scene, RunConfig.load(None, ["geometry.lambda_sds=0"])).refusal is None
+    fine = RunConfig.load("quick", ["guidance.model=builtin-fine"])
+    assert "what to take off" in (check_scene(scene, fine).refusal or "")
+    scene = load_edit_scene(make_scene(region=cut, integrator=_with_prompt("a pig without its ears")))
+    report = check_scene(scene, fine)
+    assert report.refusal is None and "read as  taken off: ears; body: pig" in report.lines()
 
 
 def test_a_material_that_cannot_be_learned_is_told(make_scene: Make) -> None:

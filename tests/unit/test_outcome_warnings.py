@@ -21,6 +21,7 @@ def test_nothing_is_said_of_a_good_part() -> None:
         ({"gap": 0.276}, ("0.276", "away from the base")),
         ({"islands_removed": 2}, ("2 loose pieces",)),
         ({"islands_removed": 1}, ("a loose piece",)),
+        ({"loose_pieces": 2}, ("2 pieces of the base hang free", "hold all that is to go")),
         ({"manifold": False}, ("manifold",)),
     ],
 )
@@ -28,3 +29,11 @@ def test_each_fault_is_one_line_with_a_remedy(fault: dict, named: tuple[str, ...
     (line,) = outcome_warnings(GOOD | fault)
     assert all(text.replace(" %", "%") in line or text in line for text in named)
     assert ":" in line and "\n" not in line
+
+
+def test_a_cut_may_lie_in_the_base_and_hang_on_nothing() -> None:
+    end = {"part": "part", "gap": 0.3, "position": [0.0, 0.0, 0.0]}
+    cut = GOOD | {"removed_volume": 3.0, "overlap_fraction": 0.8, "gap": 0.2, "islands_removed": 1, "free_ends": [end]}
+    assert outcome_warnings(cut) == []
+    (line,) = outcome_warnings(cut | {"inside_fraction": 0.5})
+    assert "focal regions" in line

@@ -266,3 +266,41 @@ def test_the_prompts_of_parts_are_read_alike(vocabulary: Vocabulary) -> None:
     assert [line.split(" read")[0] for line in heard] == ["prompt", "prompt of part 'hat'", "prompt of part 'back'"]
     with pytest.raises(UserError, match="part 'hat': prompt 'a sofa'.*reword"):
         take_prompt(own, "a cat with wings", "", heard.append, "a cat", {"hat": ("a sofa", "")})
+
+
+REMOVALS = {
+    ("a mug without a handle", ""): ("a mug without a handle", "taken off: handle; body: mug"),
+    ("remove the handle", "a mug with a handle"): ("a mug without a handle", "taken off: handle; body: mug"),
+    ("take the golden crown off the cat's head", ""): (
+        "a cat without a crown",
+        "taken off: crown; body: cat; ignored: golden",
+    ),
+    ("a wingless horse", ""): ("a horse without wings", "taken off: wings; body: horse"),
+    ("unicorn with no horn", ""): ("a horse without a horn", "taken off: horn; body: horse"),
+    ("the deer, antlers removed", ""): ("a deer without antlers", "taken off: antlers; body: deer"),
+}
+
+
+def test_a_prior_that_takes_parts_off_is_told_so() -> None:
+    fine = vocabulary_of("builtin-fine")
+    assert fine is not None and fine.takes_off
+    for (prompt, base), (told, summary) in REMOVALS.items():
+        reading = understood_prompt(prompt, fine, base, subtracts=True)
+        assert (reading.caption, reading.summary()) == (told, summary)
+        assert set(told.split()) <= fine.known_words()
+        with pytest.raises(UserError, match='"subtract".*builtin-fine'):
+            understood_prompt(prompt, fine, base)
+
+
+def test_what_is_taken_off_and_what_is_added_are_not_mixed_up(vocabulary: Vocabulary) -> None:
+    fine = vocabulary_of("builtin-fine")
+    assert fine is not None and not vocabulary.takes_off
+    with pytest.raises(UserError, match="builtin-fine.*lambda_sds=0"):
+        understood_prompt("a mug without a handle", vocabulary, subtracts=True)
+    with pytest.raises(UserError, match="asks for crown.*what to take off"):
+        understood_prompt("a cat with a crown but no wings", fine, subtracts=True)
+    with pytest.raises(UserError, match="knows no"):
+        understood_prompt("an elephant without its trunk", fine, subtracts=True)
+    own = Listening(fine)
+    take_prompt(own, "no crown", "", lambda line: None, "a cat", {"left": ("no wings", "")}, subtracts=True)
+    assert own.told == ["a cat without a crown", ""] and own.parts == {"left": ("a cat without wings", "")}

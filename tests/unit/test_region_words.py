@@ -149,9 +149,15 @@ def test_commands_take_places_and_assets(make_scene: Make, tmp_path: Path, capfd
     assert main(["check", box, "--prompt", "a box with a hat", "--at", "top", "--set", "geometry.lambda_sds=0"]) == 0
     out, err = capfd.readouterr()
     assert "prompt   a box with a hat" in out and "region   top" in out and err.count("\n") == 1
+    off = ["--subtract", "--prompt", "a box without a hat", "--set", "guidance.model=builtin-fine"]
+    for asked in ([scene, "--at", "head"], [box, "--at", "top"]):
+        assert main(["check", *asked, *off]) == 0
+        out, err = capfd.readouterr()
+        assert "read as  taken off: hat; body: " in out and "subtracts" in err
     for arguments, words in (
         ([scene, "--up", "z"], "--up: is for mesh files"),
         ([scene, "--size", "0.3"], "--size"),
+        ([scene, "--subtract"], "--subtract: is for the regions of --at"),
         ([scene, "--at", "knee"], "--at knee"),
         ([scene, "--at", "head", "--regions", scene], "give one of the two"),
         ([box, "--at", "head", "--regions", scene], "give one of the two"),

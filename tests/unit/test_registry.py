@@ -398,7 +398,8 @@ def test_a_loss_without_weight_is_not_even_made(monkeypatch: pytest.MonkeyPatch)
     assert samples is not None and busy.weights == {"volume": 3, "doubtful": 2} and Doubtful.made == 1
     assert list(busy(torch.ones(len(samples)), samples, 0)) == ["volume", "doubtful"]
     monkeypatch.setattr(Doubtful, "in_cuts", False)
-    assert field_losses("geometry.losses.doubtful.lambda=2", subtracts=True).draw(0) is None
+    cut = ("geometry.losses.doubtful.lambda=2", "geometry.lambda_volume=3")
+    assert field_losses(*cut, subtracts=True).draw(0) is None
 
 
 def test_a_loss_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,6 +68,7 @@ def import_file(
     units: str | None = None,
     at: Sequence[str] = (),
     size: str | None = None,
+    subtract: bool = False,
 ) -> ImportedAsset:
     """Write a scene to edit; see `api.import_asset`.
 
@@ -92,7 +93,7 @@ def import_file(
     orientation = find_orientation(vertices, faces, suffix, (asset.up, asset.front), (wanted[0], wanted[1]))
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
-    regions, about = placed_regions(places, at or ("head",), size)
+    regions, about = placed_regions(places, at or ("head",), size, subtract)
     words = _words(path)
     text = SceneText(
         prompt=prompt or words,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,8 +17,13 @@ from fd_mitsuba.scene.plugins import DUAL_PATH
 from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion, region_size
 
 
-def placed_regions(places: ObjectPlaces, at: Sequence[str], size: str | None) -> tuple[list[PlacedRegion], list[str]]:
+def placed_regions(
+    places: ObjectPlaces, at: Sequence[str], size: str | None, subtract: bool = False
+) -> tuple[list[PlacedRegion], list[str]]:
     """A region for each place, named apart, and a sentence about each.
+
+    Args:
+        subtract: whether what they hold is cut out of the base.
 
     Raises:
         UserError: a place or a size that is not known.
@@ -29,12 +35,18 @@ def placed_regions(places: ObjectPlaces, at: Sequence[str], size: str | None) ->
         places.region(place, extent, f"{place.name}_{number}" if count[place.name] > 1 else place.name)
         for number, place in enumerate(found, 1)
     ]
-    shown = " x ".join(f"{value:.3g}" for value in extent)
+    regions = [replace(region, subtracts=subtract) for region in regions]
+    shown = " x ".join(f"{value:.3g}" for value in extent) + (", subtracts" if subtract else "")
     return regions, [f"{region.name}: {place.about}, {shown}" for place, region in zip(found, regions, strict=True)]
 
 
 def write_placed_regions(
-    scene: Path, parameters: Mapping[str, str], at: Sequence[str], size: str | None, target: Path
+    scene: Path,
+    parameters: Mapping[str, str],
+    at: Sequence[str],
+    size: str | None,
+    target: Path,
+    subtract: bool = False,
 ) -> list[str]:
     """Write regions at places of a scene's base to `target`, an XML file for `--regions`; a sentence about each.
 
@@ -45,7 +57,7 @@ def write_placed_regions(
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in base[:-1]])
     vertices = np.concatenate([mesh.vertices for mesh in base])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(base, starts, strict=True)])
-    regions, about = placed_regions(ObjectPlaces(vertices, faces), at, size)
+    regions, about = placed_regions(ObjectPlaces(vertices, faces), at, size, subtract)
     root = ElementTree.Element("scene", version="3.0.0")
     integrator = ElementTree.SubElement(root, "integrator", type=DUAL_PATH)
     ElementTree.SubElement(integrator, "boolean", name="only_these_regions", value="true")

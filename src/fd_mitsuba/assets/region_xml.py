@@ -6,12 +6,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from fd_mitsuba.scene.focal_region import SUBTRACT
 from fd_mitsuba.scene.region_words import PlacedRegion
 
 
 def region_element(region: PlacedRegion) -> ElementTree.Element:
     """The `<shape type="focal_region">`, with a scale, a rotation and a translation."""
     element = ElementTree.Element("shape", type="focal_region", id=region.name)
+    if region.subtracts:
+        ElementTree.SubElement(element, "string", name="mode", value=SUBTRACT)
     transform = ElementTree.SubElement(element, "transform", name="to_world")
     x, y, z = map(_short, region.half_axes)
     ElementTree.SubElement(transform, "scale", x=x, y=y, z=z)

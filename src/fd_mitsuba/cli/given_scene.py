@@ -41,8 +41,9 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
         if getattr(options, name) is not None:
             raise UserError(f"--{name}: is for mesh files; a scene's to_world turns its shapes")
     if not options.at:
-        if options.size is not None:
-            raise UserError("--size: is that of the regions of --at; say where they go, too")
+        for name in ("size", "subtract"):
+            if getattr(options, name):
+                raise UserError(f"--{name}: is for the regions of --at; say where they go, too")
         return
     if options.regions is not None:
         raise UserError("--at and --regions: give one of the two")
@@ -51,7 +52,8 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
 
     folder = temporary_folder() if beside is None else beside.parent
     target = folder / ("regions.xml" if beside is None else f"{beside.name}.regions.xml")
-    about = write_placed_regions(Path(options.scene), definitions(options), options.at, options.size, target)
+    how = options.at, options.size, target, options.subtract
+    about = write_placed_regions(Path(options.scene), definitions(options), *how)
     for line in about:
         say(f"region {line}; in place of the scene's own")
     options.regions = str(target)
@@ -69,6 +71,7 @@ def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[s
         "front": options.front,
         "at": list(options.at),
         "size": options.size,
+        "subtract": options.subtract,
     }
     folder = temporary_folder() / asset.stem if beside is None else beside.with_name(f"{beside.name}.scene")
     record = {"asset": asset.name, "options": wanted, "bytes": _bytes(asset)}

@@ -43,6 +43,7 @@ def _import(options: argparse.Namespace) -> int:
         at=options.at,
         size=options.size,
         light=options.light,
+        subtract=options.subtract,
     )
     for line in imported.lines():
         say(line)

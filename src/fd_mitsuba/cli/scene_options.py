@@ -37,7 +37,7 @@ def scene_changes(parser: argparse.ArgumentParser) -> None:
 
 
 def placing_options(parser: argparse.ArgumentParser) -> None:
-    """--at and --size."""
+    """--at, --size and --subtract."""
     parser.add_argument(
         "--at",
         action="append",
@@ -48,6 +48,9 @@ def placing_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--size", metavar="SIZE", help="of these regions: a share of the longest side such as 0.3 or 30%%, or 12u"
+    )
+    parser.add_argument(
+        "--subtract", action="store_true", help="these regions take something off, in place of adding a part"
     )
 
 

@@ -38,9 +38,11 @@ class CutBase:
         faces: name of a part -> the faces that cutting it out has made on all shapes, welded, user frame, seen from
             where the part was; not closed. Parts that removed nothing are left out.
         is_cut: whether each of them changed.
-        removed: name of a part -> what it took away of all shapes, user frame.
+        removed: name of a part -> what it took away of all shapes, without the crumbs, user frame.
         figures: `removed_volume`, cubic user units, shapes that overlap counted one by one; `volume_change_error`,
-            |base - cut - removed| / removed, three volumes that are measured one by one.
+            |base - cut - removed| / removed, three volumes that are measured one by one; `crumbs`, how many small
+            pieces went because nothing held them any more; `loose_pieces`, how many larger ones are left.
+        crumbs: those small pieces, user frame.
     """
 
     shapes: tuple[BaseShape | None, ...]
@@ -49,6 +51,7 @@ class CutBase:
     is_cut: tuple[bool, ...]
     removed: dict[str, Solid]
     figures: dict[str, float]
+    crumbs: tuple[Solid, ...] = ()
 
     def names(self, opened: bool = False) -> dict[int, str | None]:
         """Number of a shape that was cut -> the name of its file, `open_...` if opened, None where nothing is left."""
@@ -58,6 +61,21 @@ class CutBase:
                 taken = [name for name in names.values() if name is not None]
                 names[i] = None if shape is None else cut_file(shape.name, "open" if opened else "cut", taken)
         return names
+
+    def without_crumbs(self, union: Solid, margin: float) -> Solid:
+        """Another surface of what is left, in the user frame, without its pieces in the places of the crumbs.
+
+        Args:
+            margin: how much wider than the crumbs these pieces may be.
+        """
+        piece = union.pieces()
+        gone = np.zeros(len(piece), dtype=bool)
+        for number in range(1 + max(piece, default=-1)):
+            own = union.vertices[np.unique(union.faces[piece == number])]
+            for crumb in self.crumbs:
+                low, high = crumb.vertices.min(axis=0) - margin, crumb.vertices.max(axis=0) + margin
+                gone[piece == number] |= bool(np.all(own > low) and np.all(own < high))
+        return Solid(union.vertices, union.faces[~gone])
 
     def files(self, opened: bool = False) -> dict[str, bytes]:
         """File name -> PLY of every shape that was cut and has something left, in the shape's own frame."""
@@ -85,6 +103,8 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
     shapes, opened, is_cut, pieces = [], [], [], {name: [] for name in tools}
     faces: dict[str, list[np.ndarray]] = {name: [] for name in tools}
     before = after = removed = 0.0
+    crumbs: list[manifold3d.Manifold] = []
+    loose = 0
     for shape, mesh in zip(base_shapes(scene, file), scene.base, strict=True):
         left: BaseShape | None = shape
         maker = np.full(len(shape.faces), -1)
@@ -97,7 +117,10 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
             removed += (whole ^ volume).volume()
             for number, tool in enumerate(near.values()):
                 if left is not None:
-                    left, maker = _cut(left, tool.moved(np.linalg.inv(shape.to_world)), maker, number)
+                    left, maker, cut = _cut(left, tool.moved(np.linalg.inv(shape.to_world)), maker, number)
+                    fallen = [crumb.transform(shape.to_world[:3]) for crumb in cut.crumbs]
+                    removed += sum((crumb - volume).volume() for crumb in fallen)
+                    crumbs, loose = [*crumbs, *fallen], loose + len(cut.loose)
             before += _volume(shape)
             after += 0.0 if left is None else _volume(left)
             for number, name in enumerate(near):
@@ -113,8 +136,10 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
         raise UserError(f"{scene.path}: nothing is left of the base; shrink the region")
     solids_removed = {name: _solid(found) for name, found in pieces.items()}
     figures = {"removed_volume": before - after, "volume_change_error": abs(before - after - removed) / removed}
+    figures |= {"crumbs": len(crumbs), "loose_pieces": loose}
     made = {name: _welded(name, np.concatenate(corners)) for name, corners in faces.items() if corners}
-    return CutBase(tuple(shapes), tuple(opened), made, tuple(is_cut), solids_removed, figures)
+    fallen = tuple(_solid([crumb]) for crumb in crumbs)
+    return CutBase(tuple(shapes), tuple(opened), made, tuple(is_cut), solids_removed, figures, fallen)
 
 
 def shape_ply(shape: BaseShape) -> bytes:
@@ -131,8 +156,8 @@ def shape_ply(shape: BaseShape) -> bytes:
     return attribute_ply(vertices, shape.faces, shape.normals, shape.uv, attributes)
 
 
-def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple[BaseShape | None, np.ndarray]:
-    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left.
+def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple[BaseShape | None, np.ndarray, CutMesh]:
+    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left. And the cut.
 
     Args:
         maker: (F,) the number of the solid that made each face, -1: none.
@@ -142,11 +167,11 @@ def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple
     empty = np.zeros((len(shape.vertices), 0))
     cut = cut_mesh(shape.name, shape.vertices, shape.faces, np.concatenate([empty, *carried], axis=1), tool)
     if cut.untouched.sum() == len(shape.faces) and len(cut.faces) == len(shape.faces):
-        return shape, maker
+        return shape, maker, cut
     if not len(cut.faces):
-        return None, maker[:0]
+        return None, maker[:0], cut
     own = cut.source < 0
-    return _assembled(shape, cut), np.concatenate([maker[cut.source[~own]], np.full(int(own.sum()), number)])
+    return _assembled(shape, cut), np.concatenate([maker[cut.source[~own]], np.full(int(own.sum()), number)]), cut
 
 
 def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:

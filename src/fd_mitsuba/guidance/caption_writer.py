@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from fd_mitsuba.guidance.phrase_groups import Group
 from fd_mitsuba.guidance.prompt_tokens import Token
-from fd_mitsuba.guidance.vocabulary import Vocabulary, article_of, bare
+from fd_mitsuba.guidance.vocabulary import WITHOUT, Vocabulary, article_of, bare
 from fd_mitsuba.guidance.word_table import WordTable
 
 _LINKS = (("with",), ("that", "has"))
@@ -49,6 +49,16 @@ class CaptionWriter:
         words = [self._part(part) for part in parts]
         subject = self._body(body, name)
         return f"{subject} {self._link(body, parts[0])} {' and '.join(words)}" if parts else subject
+
+    def removal(self, body: Group | None, name: str | None, parts: Sequence[Group]) -> str:
+        """ "a brown dog without a crown"; what the parts look like is not told.
+
+        Args:
+            body, name: as of `caption`.
+            parts: at least one.
+        """
+        words = [self._part(part) for part in parts]
+        return f"{self._body(body, name)} {WITHOUT} {' and '.join(words)}"
 
     def _body(self, group: Group | None, name: str | None) -> str:
         noun = self._noun(name)

@@ -16,15 +16,17 @@ def take_prompt(
     say: Callable[[str], None],
     base_prompt: str = "",
     part_prompts: Mapping[str, tuple[str, str]] | None = None,
+    subtracts: bool = False,
 ) -> None:
     """Set the prompts. A model that lists its words is told the caption of `prompt_reader.read_prompt`, and `say` hears
     how the prompt was read; any other model gets the prompts as they are.
 
     Args:
         part_prompts: part -> its own prompt and negative prompt, read in the same way.
+        subtracts: whether the focal regions cut.
 
     Raises:
-        UserError: the model lists its words, and a prompt asks for none of its parts.
+        UserError: the model lists its words, and a prompt asks for none of its parts, or takes none off in a cut.
     """
     parts = dict(part_prompts or {})
     vocabulary = guidance.conventions.vocabulary
@@ -35,12 +37,12 @@ def take_prompt(
             verb = "is" if len(unknown) == 1 else "are"
             say(f"the prompt's {', '.join(map(repr, unknown))} {verb} unknown to the model, which may draw anything")
         return
-    reading = understood_prompt(prompt, vocabulary, base_prompt)
+    reading = understood_prompt(prompt, vocabulary, base_prompt, subtracts)
     guidance.set_prompt(reading.caption, known_text(negative_prompt, vocabulary))
     say(f"prompt read as {reading.summary()}")
     told = {}
     for part, (own, negative) in parts.items():
-        reading = understood_part_prompt(part, own, vocabulary, base_prompt)
+        reading = understood_part_prompt(part, own, vocabulary, base_prompt, subtracts)
         told[part] = reading.caption, known_text(negative, vocabulary)
         say(f"prompt of part {part!r} read as {reading.summary()}")
     guidance.set_part_prompts(told)

@@ -28,7 +28,8 @@ class PromptReading:
     """Attributes:
     parts: names of the known parts that the prompt asks for; empty if there is none.
     bodies: name of the known body that they go on; empty where neither the prompt nor the base prompt names one.
-    caption: what the model is told; "" without a part.
+    caption: what the model is told; "" without a part. Where the prompt only takes parts off, and the model has learned
+        that, "a mug without a handle".
     styles: names of the parts' colours and materials.
     removed: parts that the prompt wants off, or not to be there.
     unknown_parts: parts that it asks for and that the model does not know.
@@ -55,11 +56,13 @@ class PromptReading:
             return f"{name} (for {', '.join(map(repr, said))})" if said else name
 
         parts = [named(name) for name in self.parts] or ["none that is known"]
+        only_off = bool(self.caption) and not self.parts
         listed = {
-            "part" if len(parts) == 1 else "parts": parts,
+            "taken off": [named(name) for name in self.removed] if only_off else [],
+            "part" if len(parts) == 1 else "parts": [] if only_off else parts,
             "look": self.styles,
             "body": [named(name) for name in self.bodies] or ["none that is known"],
-            "not wanted": self.removed,
+            "not wanted": [] if only_off else self.removed,
             "not known": self.unknown_parts,
             "ignored": self.ignored,
         }
@@ -91,9 +94,12 @@ def read_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> P
     writer = CaptionWriter(vocabulary, table, tokens, negated)
     whole = subjects.body is not None and subjects.body.entry.kind == "whole"
     told = [group for group in wanted if group is not subjects.body]
-    caption = writer.caption(subjects.body, body, told) if wanted else ""
-    known_body = [group for group in (subjects.body,) if group is not None and group.entry.known]
     not_wanted = [group for group in named if group.entry.name in removed]
+    off = list({group.entry.name: group for group in reversed(not_wanted) if group.entry.known}.values())[::-1]
+    caption = writer.caption(subjects.body, body, told) if wanted else ""
+    if not wanted and off and vocabulary.takes_off:
+        caption = writer.removal(subjects.body, body, off)
+    known_body = [group for group in (subjects.body,) if group is not None and group.entry.known]
     return PromptReading(
         parts=tuple(group.entry.name for group in wanted),
         bodies=() if body is None else (body,),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from fd_mitsuba.config.for_model import BUILTIN_FINE
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
@@ -11,48 +9,73 @@ from fd_mitsuba.guidance.prompt_reader import PromptReading, read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 
 
-def understood_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> PromptReading:
-    """The reading of a prompt that asks for a part that the model knows.
+def understood_prompt(
+    prompt: str, vocabulary: Vocabulary, base_prompt: str = "", subtracts: bool = False
+) -> PromptReading:
+    """The reading of a prompt that asks for a part that the model knows, or takes one off.
+
+    Args:
+        subtracts: whether the focal regions cut, so that the prompt must take a part off and ask for none.
 
     Raises:
-        UserError: it asks for none, or only names what to leave away.
+        UserError: the prompt does not fit, or the model has not learned to take parts off.
     """
+    if subtracts:
+        return _understood_removal(prompt, vocabulary, base_prompt)
     reading = read_prompt(prompt, vocabulary, base_prompt)
     if reading.parts:
         return reading
     if reading.removed and not reading.unknown_parts:
         off = ", ".join(map(repr, reading.removed))
         raise UserError(
-            f"prompt {prompt!r}: asks for no part, only for no {off}, and the built-in prior adds; name what to "
-            'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> and set '
-            "geometry.lambda_sds=0"
+            f"prompt {prompt!r}: asks for no part, only for no {off}, where the focal regions add; name what to "
+            'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> '
+            f"(--subtract beside --at) and set guidance.model={BUILTIN_FINE}"
         )
+    raise UserError(f"prompt {prompt!r}: {_unknown(reading, prompt, vocabulary, base_prompt)}")
+
+
+def _understood_removal(prompt: str, vocabulary: Vocabulary, base_prompt: str) -> PromptReading:
+    if not vocabulary.takes_off:
+        raise UserError(
+            "the focal regions subtract, and this prior knows only parts that are added; set "
+            f"guidance.model={BUILTIN_FINE}, which can take parts off, or geometry.lambda_sds=0 to cut out the regions "
+            "as they are, or guidance.model to a Stable Diffusion folder"
+        )
+    reading = read_prompt(prompt, vocabulary, base_prompt)
+    if reading.parts:
+        wanted = ", ".join(reading.parts)
+        raise UserError(
+            f"prompt {prompt!r}: asks for {wanted}, where the focal regions subtract; say what to take off, as in "
+            '"a mug without a handle", or leave mode="subtract" out'
+        )
+    if not reading.caption:
+        raise UserError(f"prompt {prompt!r}: {_unknown(reading, prompt, vocabulary, base_prompt)}")
+    return reading
+
+
+def _unknown(reading: PromptReading, prompt: str, vocabulary: Vocabulary, base_prompt: str) -> str:
+    """What the prior does not know, and what may have been meant."""
     unknown = ", ".join(map(repr, reading.unknown_parts))
     which = f"knows no part {unknown}" if unknown else "knows no such part"
     if (fine := vocabulary_of(BUILTIN_FINE)) is not None and vocabulary != fine:
         if known := read_prompt(prompt, fine, base_prompt).parts:
-            raise UserError(
-                f"prompt {prompt!r}: the built-in prior {which}, but the fine one knows {', '.join(known)}; "
+            return (
+                f"the built-in prior {which}, but the fine one knows {', '.join(known)}; "
                 f"set guidance.model={BUILTIN_FINE}"
             )
     hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
-    raise UserError(
-        f"prompt {prompt!r}: the built-in prior {which}; nearest: {hint}; reword it "
-        "(`fd_mitsuba prior` lists the words), or set guidance.model to a Stable Diffusion folder or hub id"
+    return (
+        f"the built-in prior {which}; nearest: {hint}; reword it (`fd_mitsuba prior` lists the words), or set "
+        "guidance.model to a Stable Diffusion folder or hub id"
     )
 
 
-def understood_part_prompt(part: str, prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> PromptReading:
+def understood_part_prompt(
+    part: str, prompt: str, vocabulary: Vocabulary, base_prompt: str = "", subtracts: bool = False
+) -> PromptReading:
     """The reading of a part's own prompt; UserError as `understood_prompt`, which names the part."""
     try:
-        return understood_prompt(prompt, vocabulary, base_prompt)
+        return understood_prompt(prompt, vocabulary, base_prompt, subtracts)
     except UserError as error:
         raise UserError(f"part {part!r}: {error}") from None
-
-
-def cuts_are_unknown(scene: Path) -> UserError:
-    """Why a model that lists its words cannot guide regions that subtract."""
-    return UserError(
-        f"{scene}: its regions subtract, and the built-in prior knows only parts that are added; set "
-        "geometry.lambda_sds=0 to cut out the regions themselves, or guidance.model to a Stable Diffusion folder"
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
+WITHOUT = "without"
 _ARTICLES = ("a pair of ", "a row of ", "a ", "an ", "the ", "one ", "two ")
 
 
@@ -20,6 +21,11 @@ class Vocabulary(BaseModel):
     """Words that name a body with its part, and that part: "unicorn" -> "horn"."""
     words: tuple[str, ...] = ()
     """All other words: adjectives, colours, materials, links."""
+
+    @property
+    def takes_off(self) -> bool:
+        """Whether the model has learned captions of removal, "a mug without a handle"."""
+        return WITHOUT in self.words
 
     def known_words(self) -> frozenset[str]:
         """Every single word of the phrases and of `words`."""

@@ -9,7 +9,7 @@ from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading
-from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown, understood_part_prompt, understood_prompt
+from fd_mitsuba.guidance.understood_prompt import understood_part_prompt, understood_prompt
 from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.check_report import BaseCheck, CheckReport, RegionCheck
 from fd_mitsuba.runs.choices import checked_choices
@@ -85,12 +85,11 @@ def _prompts(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None,
         for appearance in (stage for stage, wanted in asked.items() if wanted):
             if (vocabulary := vocabulary_of(config.guidance.model, appearance)) is None:
                 continue
-            if scene.subtracts:
-                raise cuts_are_unknown(scene.path)
-            found = understood_prompt(scene.prompt, vocabulary, scene.base_prompt)
+            found = understood_prompt(scene.prompt, vocabulary, scene.base_prompt, scene.subtracts)
             reading = reading or found
             for part, own in scene.part_prompts.items():
-                parts.setdefault(part, understood_part_prompt(part, own.prompt, vocabulary, scene.base_prompt))
+                words = own.prompt, vocabulary, scene.base_prompt, scene.subtracts
+                parts.setdefault(part, understood_part_prompt(part, *words))
     except UserError as error:
         return reading, parts, str(error)
     return reading, parts, None

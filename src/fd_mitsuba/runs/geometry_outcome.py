@@ -23,7 +23,6 @@ from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import AppearanceGuidance, Guidance
 from fd_mitsuba.guidance.prompt_check import take_prompt
 from fd_mitsuba.guidance.sources import load_guidance
-from fd_mitsuba.guidance.understood_prompt import cuts_are_unknown
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.io.ply import ply_bytes
@@ -48,16 +47,15 @@ def prepare_geometry(
         given: a caller's own guidance, in place of the one that `guidance.kind` and `guidance.model` name.
 
     Raises:
-        UserError: a model that cannot be loaded, a prompt that it does not know, a cut that it cannot guide.
+        UserError: a model that cannot be loaded, a prompt or a cut that it cannot guide; see `take_prompt`.
     """
     if config.geometry.lambda_sds == 0:
         return None
     guidance = load_guidance(config) if given is None else given
     if given is not None or not isinstance(guidance, DiffusionGuidance):
         return with_prompt(guidance, scene, say)
-    if guidance.conventions.vocabulary is not None and scene.subtracts:
-        raise cuts_are_unknown(scene.path)
-    take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt, texts_of_parts(scene))
+    texts = texts_of_parts(scene)
+    take_prompt(guidance, scene.prompt, scene.negative_prompt, say, scene.base_prompt, texts, scene.subtracts)
     return guidance
 
 
@@ -146,7 +144,12 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
             write_mesh(export / part_file(name), solid.vertices, solid.faces, scene)
     record = part_record(scene, parts, opened)
     write_json(export / "part.json", record)
-    write_mesh(export / "assembled.ply", union.vertices.numpy(), union.faces.numpy(), scene)
+    assembled = Solid(union.vertices.numpy(), union.faces.numpy())
+    if cut is not None and cut.crumbs:
+        there, back = np.linalg.inv(scene.frame.matrix()), scene.frame.matrix()
+        margin = 2 * stage.grid.spacing / scene.frame.scale
+        assembled = cut.without_crumbs(assembled.moved(there), margin).moved(back)
+    write_mesh(export / "assembled.ply", assembled.vertices, assembled.faces, scene)
     identical = copy_base(scene, export / "base")
     # Locality is a matter of the part as it grew: the rim inside the base is put there on purpose.
     vertices, faces = stage.extractor.extract_part(stage.final_field)
@@ -169,7 +172,7 @@ def export_geometry(stage: GeometryStage, folder: Path, finished: Mapping[str, F
         "bridged": whole.bridged,
         "gap": whole.gap(base),
         **_walls_and_ends(record["parts"]),
-        "assembled_faces": len(union.faces),
+        "assembled_faces": len(assembled.faces),
         **figures,
     }
 

@@ -20,6 +20,9 @@ def outcome_warnings(metrics: dict[str, Any]) -> list[str]:
     warnings = []
     inside, buried = metrics.get("inside_fraction", 1.0), metrics.get("overlap_fraction", 0.0)
     gap, islands = metrics.get("gap", 0.0), metrics.get("islands_removed", 0)
+    ends = metrics.get("free_ends", [])
+    if "removed_volume" in metrics:  # a cut lies in the base, hangs on nothing, and loses no piece that would be seen
+        buried, gap, islands, ends = 0.0, 0.0, 0, []
     if inside < LEAST_INSIDE:
         warnings.append(
             f"only {inside:.1%} of the part lies in its focal regions: enlarge them, raise geometry.lambda_focal, "
@@ -34,7 +37,13 @@ def outcome_warnings(metrics: dict[str, Any]) -> list[str]:
             f"a piece of the part is {gap:.3g} away from the base (its longest side is 1.8): move the regions until "
             f"they reach into the base, raise geometry.lambda_tether, or {_OTHER_SEED}"
         )
-    for end in metrics.get("free_ends", []):
+    if loose := metrics.get("loose_pieces", 0):
+        pieces, hang = ("a piece", "hangs") if loose == 1 else (f"{loose} pieces", "hang")
+        warnings.append(
+            f"{pieces} of the base {hang} free, cut off from the rest: let the regions hold all that is to go, or move "
+            "them away"
+        )
+    for end in ends:
         x, y, z = end["position"]
         warnings.append(
             f"an end of part {end['part']!r} hangs free, {end['gap']:.3g} before the base, at ({x:.4g}, {y:.4g}, "

@@ -49,12 +49,16 @@ class Place:
 
 @dataclass(frozen=True)
 class PlacedRegion:
-    """An ellipsoid: the unit sphere scaled by `half_axes`, turned by `rotation` (3, 3), moved to `centre`."""
+    """An ellipsoid: the unit sphere scaled by `half_axes`, turned by `rotation` (3, 3), moved to `centre`.
+
+    With `subtracts` its part is cut out of the base.
+    """
 
     name: str
     centre: np.ndarray
     half_axes: np.ndarray
     rotation: np.ndarray
+    subtracts: bool = False
 
     def to_world(self) -> np.ndarray:
         """(4, 4) from the unit sphere."""

@@ -149,7 +149,11 @@ class Collision(FieldLoss):
 
 @GEOMETRY_LOSSES.register("volume")
 class Volume(FieldLoss):
-    """Share of the sample points that lie in the part, smooth over two grid cells."""
+    """Share of the sample points that lie in the part, smooth over two grid cells. A cut may be as large as it likes
+    where the base is not, and how much of the base goes is for the guidance to say.
+    """
+
+    in_cuts = False
 
     def __call__(self, at: FieldSamples) -> Tensor:
         return (0.5 + at.sdf_part / (2 * at.spacing)).clamp(0, 1).mean()
