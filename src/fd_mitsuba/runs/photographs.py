@@ -12,8 +12,10 @@ from PIL import Image
 
 from fd_mitsuba.config.sections import OutputConfig
 from fd_mitsuba.io.picture import write_picture
+from fd_mitsuba.io.ply import read_ply
 from fd_mitsuba.render.tonemap import to_srgb
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.region_mode import cut_faces_name
 from fd_mitsuba.scene.scene_file import SceneFile
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.viewing.denoising import NO_DENOISER, has_denoiser
@@ -32,6 +34,8 @@ _GROWN = ("part_", "cut_face_")
 _SPP, _TURN_SPP = 4, 1
 _TURN_SIZE = 400
 _FILL, _CLOSE_FILL, _TURN_FILL = 0.82, 0.72, 0.92
+_SCAR_FILL = 0.3
+"""Of a photograph of where something was taken off: with what is around it."""
 
 
 def write_photographs(
@@ -96,13 +100,18 @@ class PhotoViews:
         names = [shape.id() for shape in grown]
         corners = [frame.to_canonical(vertex_positions(exported.mi, shape)) for shape in grown]
         whole = np.concatenate([base, *corners])
-        parts = np.concatenate(corners) if corners else base
+        cut = _cut_faces(scene, folder) if scene.subtracts and not grown else None
+        parts = np.concatenate(corners) if corners else base if cut is None else cut.reshape(-1, 3)
         ground = float(whole[:, 1].min())
         after = PhotoSet.of(exported.mi, loaded, frame, ground)
         without = scene.mitsuba_scene(without=away)
         before = PhotoSet.of(exported.mi, without, frame, ground)
-        camera = _from_best_side(after, names, whole, _FILL)
-        close = _from_best_side(after, names, parts, _CLOSE_FILL)
+
+        def shows(camera: CameraBatch) -> float:
+            return after.share_seen(camera, names) if cut is None else _turned_to(cut, camera)
+
+        camera = _from_best_side(shows, whole, _FILL)
+        close = _from_best_side(shows, parts, _CLOSE_FILL if cut is None else _SCAR_FILL)
         return cls(after, before, camera, close, after.exposure(camera, size), whole)
 
     def around(self, count: int) -> list[CameraBatch]:
@@ -114,10 +123,24 @@ class PhotoViews:
         return as_bytes(to_srgb(torch.from_numpy(linear * self.exposure).permute(2, 0, 1)[None]))[0]
 
 
-def _from_best_side(photo_set: PhotoSet, names: list[str], points: np.ndarray, fill: float) -> CameraBatch:
-    """From the front right, unless another side shows clearly more of the parts."""
+def _cut_faces(scene: EditScene, folder: Path) -> np.ndarray | None:
+    """Corners (F, 3, 3) of what cuts have laid bare, canonical frame; None where that is nothing."""
+    paths = [folder / "export" / f"{cut_faces_name(name)}.ply" for name in scene.parts]
+    meshes = [read_ply(path) for path in paths if path.is_file()]
+    corners = [scene.frame.to_canonical(vertices)[faces] for vertices, faces in meshes]
+    return np.concatenate(corners) if corners else None
+
+
+def _turned_to(corners: np.ndarray, camera: CameraBatch) -> float:
+    """How large triangles (F, 3, 3) appear that look to the camera, as if nothing stood before them."""
+    towards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ camera.basis()[2][0]
+    return float(towards.clip(min=0).sum())
+
+
+def _from_best_side(shows: Callable[[CameraBatch], float], points: np.ndarray, fill: float) -> CameraBatch:
+    """From the front right, unless another side shows clearly more."""
     cameras = [framed_camera(points, azimuth, _ELEVATION_DEG, _FOV_DEG, fill) for azimuth in _AZIMUTHS_DEG]
-    shares = [photo_set.share_seen(camera, names) for camera in cameras]
+    shares = [shows(camera) for camera in cameras]
     most = int(np.argmax(shares))
     return cameras[most if shares[most] > _CLEARLY_MORE * shares[0] else 0]
 
