@@ -1,9 +1,11 @@
 """How close a run's photographs are to what many samples show, with the denoiser and with the same seconds without.
 
     python benchmarks/photograph_noise.py RUN [--reference 4096] [--window 256] [--spp 2 4 8]
+    python benchmarks/photograph_noise.py RUN --tiles 16 [--reference 4096] [--spp 4 8]
 
 Compares a square window of the photograph around the part, in sRGB with the run's exposure: PSNR in decibels, and the
-brightest excess over the reference (a firefly would be one of more than .2).
+brightest excess over the reference (a firefly would be one of more than .2). With --tiles the whole photograph instead,
+as the run makes it, at so many squares of 64 pixels that are spread over it.
 """
 
 from __future__ import annotations
@@ -29,10 +31,14 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=4096, help="samples a pixel of the reference")
     parser.add_argument("--size", type=int, default=1024, help="pixels a side of the photograph")
     parser.add_argument("--window", type=int, default=256, help="pixels a side of what is compared")
+    parser.add_argument("--tiles", type=int, help="squares of 64 pixels of the whole photograph, such as 16")
     parser.add_argument("--spp", type=int, nargs="+", default=[2, 4, 8])
     options = parser.parse_args()
     scene, _ = saved_run(options.run)
     views = PhotoViews.of(scene, options.run)
+    if options.tiles:
+        whole(views, options)
+        return
     for name, camera in (("beauty", views.camera), ("closeup", views.close)):
         box = _window(views, name, camera, options.size, options.window)
         truth = _shown(views, views.after.radiance(camera, options.size, options.reference, 99, box))
@@ -55,6 +61,27 @@ def main() -> None:
                 row = {"image": name, "spp": spp, "kind": kind, "psnr_db": round(_psnr(found, truth), 2)}
                 row |= {"excess": round(float((found - truth).max()), 3), "cpu_seconds": round(spent, 2)}
                 print(json.dumps(row), flush=True)
+
+
+def whole(views: PhotoViews, options: argparse.Namespace) -> None:
+    """Prints the PSNR of whole photographs, by random squares, one in each cell of a lattice."""
+    side, cells = 64, int(np.ceil(np.sqrt(options.tiles)))
+    rng, room = np.random.default_rng(0), options.size / cells - 64
+    for name, camera in (("beauty", views.camera), ("closeup", views.close)):
+        lows = [
+            (np.array(cell) * options.size / cells + rng.random(2) * room).astype(int)
+            for cell in np.ndindex(cells, cells)
+        ]
+        boxes = [tuple(slice(low, low + side) for low in pair) for pair in lows]
+        truth = [_shown(views, views.after.radiance(camera, options.size, options.reference, 99, box)) for box in boxes]
+        for spp in options.spp:
+            start = time.process_time()
+            found = _shown(views, views.after.photograph(camera, options.size, spp))
+            spent = time.process_time() - start
+            psnr = _psnr(np.stack([found[box] for box in boxes]), np.stack(truth))
+            excess = max(float((found[box] - true).max()) for box, true in zip(boxes, truth, strict=True))
+            row = {"image": name, "spp": spp, "kind": "whole", "psnr_db": round(psnr, 2), "excess": round(excess, 3)}
+            print(json.dumps(row | {"cpu_seconds": round(spent, 2)}), flush=True)
 
 
 def _window(views: PhotoViews, name: str, camera: object, size: int, side: int) -> tuple[slice, slice]:

@@ -21,7 +21,6 @@ from fd_mitsuba.render.geometry_pass import RAYS_AT_ONCE
 from fd_mitsuba.runs.network_size import NetworkSize
 from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
 
 _MIB = 2.0**20
 _IMPORTS, _BUILTIN = 390.0, 200.0
@@ -39,7 +38,7 @@ _PER_TABLE_BYTE = 10.0
 _PER_PHOTOGRAPHED_PIXEL = 250.0
 _PER_SAMPLE, _PER_RAY, _PER_FRAME_PIXEL = 59.0, 85.0, 30.0
 _USUAL_FRAME_PIXELS = 48 * 256**2
-_USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, SAMPLES_AT_ONCE, 1024**2
+_USUAL_GRID, _USUAL_SAMPLES, _USUAL_TEXELS = 65**3, 1 << 21, 1024**2
 _TIGHT, _TOO_MUCH = 0.9, 1.25
 """Shares of what is left from which a run is warned of, and refused: the forecast is right to about 15 %."""
 _WORTH_NAMING = 0.25
@@ -72,7 +71,7 @@ def run_memory(size: SceneSize, config: RunConfig, stages: tuple[str, ...], netw
         settings, output = config.appearance, config.output
         side = settings.picture_size or (32 if is_builtin(config.guidance.model) else 8 * network.latent_size)
         step = settings.views * side**2 * settings.spp
-        photograph = max(SAMPLES_AT_ONCE, output.picture_size**2)
+        photograph = max(_USUAL_SAMPLES, output.picture_size**2)
         name = "output.picture_size" if photograph >= step else "appearance.spp"
         terms[name] = _PER_SAMPLE * (max(photograph, step) - _USUAL_SAMPLES) / _MIB
         terms["photographs"] = _PER_PHOTOGRAPHED_PIXEL * output.picture_size**2 / _MIB

@@ -20,7 +20,8 @@ def denoised(colour: np.ndarray, albedo: np.ndarray, normal: np.ndarray, quick: 
     Args:
         colour: (H, W, 3) linear radiance of independent pixels, so of a box filter. Values that are not finite count 0.
         albedo: (H, W, 3) in [0, 1], and
-        normal: (H, W, 3) shading normals in [-1, 1], both of the same view: where they have an edge, the image may.
+        normal: (H, W, 3) shading normals in [-1, 1], both of the same view and all but free of noise themselves: where
+            they have an edge, the image may.
 
         quick: half the time for a little of the detail.
 
@@ -32,4 +33,4 @@ def denoised(colour: np.ndarray, albedo: np.ndarray, normal: np.ndarray, quick: 
     images = [np.nan_to_num(image, posinf=0.0, neginf=0.0) for image in (colour, albedo, normal)]
     images = [np.ascontiguousarray(image, dtype=np.float32) for image in images]
     quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
-    return np.array(mitsuba_oidn.denoise(*images, hdr=True, quality=quality)).clip(min=0)
+    return np.array(mitsuba_oidn.denoise(*images, hdr=True, clean_aux=True, quality=quality)).clip(min=0)
