@@ -111,7 +111,7 @@ class PhotoViews:
             return after.share_seen(camera, names) if cut is None else _turned_to(cut, camera)
 
         camera = _from_best_side(shows, whole, _FILL)
-        close = _from_best_side(shows, parts, _CLOSE_FILL if cut is None else _SCAR_FILL)
+        close = _from_best_side(shows, parts, _SCAR_FILL if scene.subtracts else _CLOSE_FILL)
         return cls(after, before, camera, close, after.exposure(camera, size), whole)
 
     def around(self, count: int) -> list[CameraBatch]:
