@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -23,7 +24,16 @@ needs_validator = pytest.mark.skipif(
 needs_browser = pytest.mark.skipif(
     _without("chromium", "playwright-core"), reason="needs chromium, and npm install in tools/viewers"
 )
-needs_blender = pytest.mark.skipif(shutil.which("blender") is None, reason="needs blender")
+_BLENDER_SCRIPT = str(VIEWERS / "blender_import.py")
+BLENDER = (
+    [os.environ["BPY_PYTHON"], _BLENDER_SCRIPT, "--"]
+    if "BPY_PYTHON" in os.environ
+    else ["blender", "-b", "--factory-startup", "--python-exit-code", "3", "-P", _BLENDER_SCRIPT, "--"]
+)
+"""Starts our script in Blender; its arguments follow."""
+needs_blender = pytest.mark.skipif(
+    shutil.which(BLENDER[0]) is None, reason="needs blender, or in BPY_PYTHON a Python that has bpy"
+)
 
 
 def glb_faults(*paths: Path) -> dict[str, Any]:

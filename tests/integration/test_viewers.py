@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_export_assets import Learned, exported, textured_base  # noqa: F401
-from viewer_setup import VIEWERS, needs_blender, needs_browser
+from viewer_setup import BLENDER, VIEWERS, needs_blender, needs_browser
 
 from fd_mitsuba.backend.file_threads import file_threads
 from fd_mitsuba.io.srgb import srgb_from_linear
@@ -38,18 +38,9 @@ def export(make_scene: Make, textured_base: str, tmp_path: Path) -> tuple[EditSc
 @pytest.mark.parametrize("model", ["asset.glb", "obj/asset.obj"])
 def test_blender(export: tuple[EditScene, Path], model: str, tmp_path: Path, mi: Any) -> None:
     scene, folder = export
-    command = [
-        "blender",
-        "-b",
-        "--factory-startup",
-        "--python-exit-code",
-        "3",
-        "-P",
-        str(VIEWERS / "blender_import.py"),
-    ]
     output = tmp_path / "blender"
-    arguments = ["--", str(folder / model), str(folder / "mitsuba" / "scene.xml"), str(output), "8"]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True)
+    arguments = [str(folder / model), str(folder / "mitsuba" / "scene.xml"), str(output), "8"]
+    done = subprocess.run([*BLENDER, *arguments], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("FOUND "))
     found = json.loads(line.removeprefix("FOUND "))
