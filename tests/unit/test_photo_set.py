@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter
 
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.scene_file import ready_mitsuba
@@ -78,6 +79,21 @@ def test_without_a_denoiser_a_photograph_has_more_samples(ball: PhotoSet, monkey
     camera = framed_camera(np.array([[-1.0, 0, -1], [1, 0, 1]]), 30.0, 20.0, 25.0)
     monkeypatch.setattr(photo_set, "has_denoiser", lambda: False)
     assert np.array_equal(ball.photograph(camera, 16, 2), ball.radiance(camera, 16, 8))
+
+
+def test_the_grain_of_a_pixel_is_not_that_of_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A denoiser keeps what pixels have in common: 0.16 and 0.12 of it, with seeds of portions that are near."""
+    mi = ready_mitsuba()
+    place = mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90)
+    lamp = {"type": "rectangle", "to_world": place, "light": {"type": "area"}}
+    shade = {"type": "sphere", "center": [0, 1.2, 0], "radius": 0.6}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "shade": shade}, optimize=False)
+    photo = PhotoSet.of(mi, scene, Normalisation(np.zeros(3), 1.0), 0.0)
+    monkeypatch.setattr(photo_set, "SAMPLES_AT_ONCE", 4 * 128**2)
+    image = photo.radiance(framed_camera(np.array([[-1.0, 0, -1], [1, 0, 1]]), 30.0, 20.0, 25.0), 128, 16)[..., 1]
+    grain = image - uniform_filter(image, 9)
+    for columns in (1, 2):
+        assert abs((grain[:, columns:] * grain[:, :-columns]).mean() / grain.var()) < 0.06
 
 
 @pytest.mark.skipif(not has_denoiser(), reason="needs mitsuba-oidn")

@@ -135,8 +135,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
         warning = str(error)
     once = START_AND_EXPORT_SECONDS + _SECONDS_PER_MILLION_FACES * more_faces
     total = step * geometry.steps + slower * once
-    # The prior of colours is as coarse as ever.
-    lit = _appearance_step(scene, config, encoder if builtin else forward, encoder, slower)
+    lit = _appearance_step(scene, config, forward, encoder, slower)
     once = LIT_PICTURES_SECONDS + _photographs(config.output.picture_size)
     once += _SECONDS_PER_MILLION_FACES * more_faces + _SECONDS_PER_MILLION_LIGHT_PIXELS * more_light
     once += _SECONDS_PER_MILLION_TEXELS * max(config.output.texture_size**2 - _USUAL_TEXELS, 0) / 1e6

@@ -10,7 +10,7 @@ import torch
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.render.tonemap import to_srgb
 from fd_mitsuba.scene.scene_file import SceneFile
-from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE
+from fd_mitsuba.viewing.photo_set import SAMPLES_AT_ONCE, spread_seed
 from fd_mitsuba.viewing.sheets import as_bytes
 
 
@@ -34,7 +34,8 @@ def seen_by(file: SceneFile, sensor_id: str, spp: int, max_depth: int, seed: int
     total, left = np.zeros((height, width, 3), np.float32), spp
     while left > 0:  # in portions: the memory of a rendering grows with its samples
         now = min(left, max(1, SAMPLES_AT_ONCE // (width * height)))
-        drawn = np.array(mi.render(scene, sensor=sensor, integrator=path, spp=now, seed=seed * 4096 + left))
+        own = spread_seed(seed * 4096 + left)
+        drawn = np.array(mi.render(scene, sensor=sensor, integrator=path, spp=now, seed=own))
         total += np.nan_to_num(_rgb(drawn), posinf=0.0, neginf=0.0) * (now / spp)
         left -= now
     return as_bytes(to_srgb(torch.from_numpy(total).permute(2, 0, 1)[None]))[0]

@@ -92,7 +92,7 @@ class PhotoSet:
         total = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start, 3), np.float32)
         while left > 0:  # in portions: the memory of a rendering grows with its samples
             now = min(left, max(1, SAMPLES_AT_ONCE // total[..., 0].size))
-            own = _spread(seed * 4096 + left)
+            own = spread_seed(seed * 4096 + left)
             drawn = self.mi.render(self.scene, sensor=sensor, integrator=path, spp=now, seed=own)
             total += np.nan_to_num(np.array(drawn)[..., :3], posinf=0.0, neginf=0.0) * (now / spp)
             left -= now
@@ -177,7 +177,7 @@ class PhotoSet:
         )
 
 
-def _spread(seed: int) -> int:
+def spread_seed(seed: int) -> int:
     """Seeds far from each other for seeds that are near: with these, the stratified samplers of Mitsuba draw the same
     for a pixel and for one some columns further, and a denoiser takes what is alike in neighbours for the image.
     """
