@@ -55,24 +55,6 @@ def test_a_bite_has_the_volume_of_the_solid_and_nothing_else_changes() -> None:
     assert set(range(12)) - set(cut.source[cut.untouched]) == {2, 3} and set(cut.source) == {-1, *range(12)}
 
 
-def test_a_small_piece_that_a_cut_leaves_without_a_hold_goes_too() -> None:
-    vertices, faces, uv = box()
-
-    def cut_by_slab(low: float, high: float) -> CutMesh:
-        slab = trimesh.creation.box(bounds=[[low, -2, -2], [high, 2, 2]])
-        return cut_mesh("box", vertices, faces, uv, Solid(np.array(slab.vertices), np.array(slab.faces)))
-
-    cut = cut_by_slab(0.45, 0.95)  # a tenth of the slab's volume is left beyond it
-    (crumb,) = cut.crumbs
-    welded = mesh(cut)
-    welded.merge_vertices(merge_tex=True, merge_norm=True)
-    assert not cut.loose and crumb.volume() == pytest.approx(4 * 0.05)
-    assert welded.is_watertight and welded.body_count == 1 and welded.volume == pytest.approx(4 * 1.45)
-    cut = cut_by_slab(0.4, 0.8)  # half of it: nobody has asked for that to go
-    assert not cut.crumbs and cut.loose == pytest.approx([4 * 0.2])
-    assert mesh(cut).volume == pytest.approx(4 * 1.6)
-
-
 def test_split_triangles_keep_their_uvs_by_interpolation() -> None:
     vertices, faces, uv = box()
     cut = cut_mesh("box", vertices, faces, uv, ball((1.0, 0.3, 0.1), 0.4))

@@ -17,6 +17,7 @@ import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.export.base_shapes import BaseShape, base_shapes
+from fd_mitsuba.export.loose_pieces import bodies, loose_pieces
 from fd_mitsuba.export.solid.cut_base import CutMesh, cut_mesh
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.io.attribute_ply import attribute_ply
@@ -66,15 +67,15 @@ class CutBase:
         """Another surface of what is left, in the user frame, without its pieces in the places of the crumbs.
 
         Args:
-            margin: how much wider than the crumbs these pieces may be.
+            margin: how far off the crumbs these pieces may be.
         """
-        piece = union.pieces()
-        gone = np.zeros(len(piece), dtype=bool)
-        for number in range(1 + max(piece, default=-1)):
-            own = union.vertices[np.unique(union.faces[piece == number])]
-            for crumb in self.crumbs:
-                low, high = crumb.vertices.min(axis=0) - margin, crumb.vertices.max(axis=0) + margin
-                gone[piece == number] |= bool(np.all(own > low) and np.all(own < high))
+        piece, gone = union.pieces(), np.zeros(len(union.faces), dtype=bool)
+        for crumb in self.crumbs:
+            distance = MeshDistance(crumb.vertices, crumb.faces)
+            for number in np.unique(piece):
+                own = union.vertices[np.unique(union.faces[piece == number])].astype(np.float64)
+                if np.all((distance.unsigned(own) < margin) | distance.inside(own)):
+                    gone |= piece == number
         return Solid(union.vertices, union.faces[~gone])
 
     def files(self, opened: bool = False) -> dict[str, bytes]:
@@ -103,24 +104,33 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
     shapes, opened, is_cut, pieces = [], [], [], {name: [] for name in tools}
     faces: dict[str, list[np.ndarray]] = {name: [] for name in tools}
     before = after = removed = 0.0
-    crumbs: list[manifold3d.Manifold] = []
+    crumbs: list[Solid] = []
     loose = 0
     for shape, mesh in zip(base_shapes(scene, file), scene.base, strict=True):
         left: BaseShape | None = shape
         maker = np.full(len(shape.faces), -1)
         near = {name: tool for name, tool in tools.items() if _boxes_meet(tool.vertices, mesh.vertices)}
         if near:
+            body = bodies(shape.vertices, shape.faces)
             whole = manifold3d.Manifold(_plain(mesh.vertices, mesh.faces))
             for name, tool in near.items():
                 pieces[name].append(whole ^ _manifold(tool))
             volume = reduce(lambda a, b: a + b, (_manifold(tool) for tool in near.values()))
-            removed += (whole ^ volume).volume()
+            own = (whole ^ volume).volume()
             for number, tool in enumerate(near.values()):
                 if left is not None:
-                    left, maker, cut = _cut(left, tool.moved(np.linalg.inv(shape.to_world)), maker, number)
-                    fallen = [crumb.transform(shape.to_world[:3]) for crumb in cut.crumbs]
-                    removed += sum((crumb - volume).volume() for crumb in fallen)
-                    crumbs, loose = [*crumbs, *fallen], loose + len(cut.loose)
+                    left, source = _cut(left, tool.moved(np.linalg.inv(shape.to_world)))
+                    maker = np.where(source < 0, number, maker[source])
+                    body = np.where(source < 0, -1, body[source])
+            if left is not None:
+                beside = [(one.vertices, one.faces) for one in scene.base if one is not mesh]
+                vertices, triangles, _ = left.in_user_frame()
+                found = loose_pieces(vertices, triangles, body, beside, own)
+                if found.solids:
+                    left, maker = _some_faces(left, ~found.crumb), maker[~found.crumb]
+                    own += sum(solid.volume for solid in found.solids)
+                crumbs, loose = [*crumbs, *found.solids], loose + found.large
+            removed += own
             before += _volume(shape)
             after += 0.0 if left is None else _volume(left)
             for number, name in enumerate(near):
@@ -138,8 +148,7 @@ def cut_base(scene: EditScene, file: SceneFile, solids: Mapping[str, Solid]) -> 
     figures = {"removed_volume": before - after, "volume_change_error": abs(before - after - removed) / removed}
     figures |= {"crumbs": len(crumbs), "loose_pieces": loose}
     made = {name: _welded(name, np.concatenate(corners)) for name, corners in faces.items() if corners}
-    fallen = tuple(_solid([crumb]) for crumb in crumbs)
-    return CutBase(tuple(shapes), tuple(opened), made, tuple(is_cut), solids_removed, figures, fallen)
+    return CutBase(tuple(shapes), tuple(opened), made, tuple(is_cut), solids_removed, figures, tuple(crumbs))
 
 
 def shape_ply(shape: BaseShape) -> bytes:
@@ -156,22 +165,20 @@ def shape_ply(shape: BaseShape) -> bytes:
     return attribute_ply(vertices, shape.faces, shape.normals, shape.uv, attributes)
 
 
-def _cut(shape: BaseShape, tool: Solid, maker: np.ndarray, number: int) -> tuple[BaseShape | None, np.ndarray, CutMesh]:
-    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left. And the cut.
+def _cut(shape: BaseShape, tool: Solid) -> tuple[BaseShape | None, np.ndarray]:
+    """The shape without a solid of its own frame; itself if they do not meet, None if nothing is left.
 
-    Args:
-        maker: (F,) the number of the solid that made each face, -1: none.
-        number: of this solid; the faces that it makes have it in the second value returned.
+    And of each of its faces, which of the shape's it is or is a piece of; -1 for those that the cut has made.
     """
     carried = [values for values in (shape.normals, shape.uv, shape.colours) if values is not None]
     empty = np.zeros((len(shape.vertices), 0))
     cut = cut_mesh(shape.name, shape.vertices, shape.faces, np.concatenate([empty, *carried], axis=1), tool)
     if cut.untouched.sum() == len(shape.faces) and len(cut.faces) == len(shape.faces):
-        return shape, maker, cut
+        return shape, np.arange(len(shape.faces))
     if not len(cut.faces):
-        return None, maker[:0], cut
+        return None, np.zeros(0, dtype=np.int64)
     own = cut.source < 0
-    return _assembled(shape, cut), np.concatenate([maker[cut.source[~own]], np.full(int(own.sum()), number)]), cut
+    return _assembled(shape, cut), np.concatenate([cut.source[~own], cut.source[own]])
 
 
 def _assembled(shape: BaseShape, cut: CutMesh) -> BaseShape:

@@ -3,13 +3,11 @@
 manifold3d makes the cut. It works on the mesh welded by position, and returns of each triangle which one of the input
 it comes from: an input triangle that comes back whole is taken from the input itself, bit for bit, and a triangle that
 the cut splits carries the interpolated attributes. Faces of the cut itself come from the solid and have none.
-
-A small piece that the cut leaves without a hold, such as the tip of a horn that stands out of the solid, goes too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
@@ -28,8 +26,6 @@ class CutMesh:
         attributes: (V, C) float64, zero on the cut's own vertices.
         source: (F,) the input's face that a face is or is a piece of; -1: the cut's own face.
         untouched: (F,) bool, a face of the input as it was.
-        crumbs: pieces that the cut made loose and that went with it.
-        loose: volumes of those that are too large for that, in the mesh's frame.
     """
 
     vertices: np.ndarray
@@ -37,12 +33,6 @@ class CutMesh:
     attributes: np.ndarray
     source: np.ndarray
     untouched: np.ndarray
-    crumbs: tuple[manifold3d.Manifold, ...] = ()
-    loose: tuple[float, ...] = ()
-
-
-CRUMB_SHARE = 0.25
-"""Of the volume that was cut out: a loose piece up to that goes with it."""
 
 
 def cut_mesh(name: str, vertices: np.ndarray, faces: np.ndarray, attributes: np.ndarray, solid: Solid) -> CutMesh:
@@ -63,8 +53,7 @@ def cut_mesh(name: str, vertices: np.ndarray, faces: np.ndarray, attributes: np.
     if whole.status() != manifold3d.Error.NoError or not whole.volume() > 0:
         raise UserError(f"base {name!r}: is not closed, so nothing can be cut out of it; close its holes")
     tool, _ = _manifold(solid.vertices, solid.faces)
-    left, crumbs, loose = _without_crumbs(whole, tool)
-    made = left.to_mesh64()
+    made = (whole - tool).to_mesh64()
     rows = np.asarray(made.vert_properties, dtype=np.float64)
     triangles = np.asarray(made.tri_verts, dtype=np.int64)
     source = np.full(len(triangles), -1, dtype=np.int64)
@@ -72,28 +61,7 @@ def cut_mesh(name: str, vertices: np.ndarray, faces: np.ndarray, attributes: np.
     for start, end, original in zip(bounds[:-1], bounds[1:], made.run_original_id, strict=True):
         if original == whole_id:
             source[start:end] = np.asarray(made.face_id, dtype=np.int64)[start:end]
-    joined = _joined(vertices, np.asarray(faces, np.int64), attributes, rows, triangles, source)
-    return replace(joined, crumbs=crumbs, loose=loose)
-
-
-def _without_crumbs(
-    whole: manifold3d.Manifold, tool: manifold3d.Manifold
-) -> tuple[manifold3d.Manifold, tuple[manifold3d.Manifold, ...], tuple[float, ...]]:
-    """What is left, the pieces that went with the cut, and the volumes of loose ones that stay."""
-    most = CRUMB_SHARE * (whole ^ tool).volume()
-    kept, crumbs, loose = [], [], []
-    for body in whole.decompose():
-        pieces = sorted((body - tool).decompose(), key=lambda piece: -piece.volume())
-        kept += pieces[:1]
-        for piece in pieces[1:]:
-            if piece.volume() > most:
-                kept.append(piece)
-                loose.append(float(piece.volume()))
-            else:
-                crumbs.append(piece)
-    # As one boolean where all of it stays: its triangles come in another order than those of single pieces.
-    left = manifold3d.Manifold.compose(kept) if crumbs else whole - tool
-    return left, tuple(crumbs), tuple(loose)
+    return _joined(vertices, np.asarray(faces, np.int64), attributes, rows, triangles, source)
 
 
 def _joined(
