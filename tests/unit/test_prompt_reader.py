@@ -278,7 +278,20 @@ REMOVALS = {
     ("a wingless horse", ""): ("a horse without wings", "taken off: wings; body: horse"),
     ("unicorn with no horn", ""): ("a horse without a horn", "taken off: horn; body: horse"),
     ("the deer, antlers removed", ""): ("a deer without antlers", "taken off: antlers; body: deer"),
+    ("no horns and no wings on the cow", ""): ("a cow without horns and wings", "taken off: horns, wings; body: cow"),
+    ("a horse with its red wings removed", ""): (
+        "a horse without wings",
+        "taken off: wings; body: horse; ignored: red",
+    ),
+    ("take off the shades", "a cat"): ("a cat without glasses", "taken off: glasses (for 'shades'); body: cat"),
 }
+NOT_REMOVALS = (
+    "don't remove the handle",
+    "never take off the handle",
+    "a mug not without a handle",
+    "a mug that isn't without a handle",
+    "remove all except the handle",
+)
 
 
 def test_a_prior_that_takes_parts_off_is_told_so() -> None:
@@ -299,8 +312,14 @@ def test_what_is_taken_off_and_what_is_added_are_not_mixed_up(vocabulary: Vocabu
         understood_prompt("a mug without a handle", vocabulary, subtracts=True)
     with pytest.raises(UserError, match="asks for crown.*what to take off"):
         understood_prompt("a cat with a crown but no wings", fine, subtracts=True)
-    with pytest.raises(UserError, match="knows no"):
-        understood_prompt("an elephant without its trunk", fine, subtracts=True)
+    for prompt, word in (("an elephant without its trunk", "trunk"), ("a mug without a hanlde", "hanlde")):
+        with pytest.raises(UserError, match=f"takes off no part that .* knows, for it does not know '{word}'"):
+            understood_prompt(prompt, fine, subtracts=True)
+    with pytest.raises(UserError, match="takes off no part that the built-in prior knows; say"):
+        understood_prompt("an elephant", fine, subtracts=True)
+    for prompt in NOT_REMOVALS:
+        with pytest.raises(UserError, match="can be read both ways.*what is to go"):
+            understood_prompt(prompt, fine, subtracts=True)
     own = Listening(fine)
     take_prompt(own, "no crown", "", lambda line: None, "a cat", {"left": ("no wings", "")}, subtracts=True)
     assert own.told == ["a cat without a crown", ""] and own.parts == {"left": ("a cat without wings", "")}

@@ -42,7 +42,7 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
             raise UserError(f"--{name}: is for mesh files; a scene's to_world turns its shapes")
     if not options.at:
         for name in ("size", "subtract"):
-            if getattr(options, name):
+            if getattr(options, name) not in (None, False):
                 raise UserError(f"--{name}: is for the regions of --at; say where they go, too")
         return
     if options.regions is not None:
@@ -71,8 +71,9 @@ def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[s
         "front": options.front,
         "at": list(options.at),
         "size": options.size,
-        "subtract": options.subtract,
     }
+    if options.subtract:  # not in records of earlier versions
+        wanted["subtract"] = True
     folder = temporary_folder() / asset.stem if beside is None else beside.with_name(f"{beside.name}.scene")
     record = {"asset": asset.name, "options": wanted, "bytes": _bytes(asset)}
     before = read_json_object(folder / _RECORD)

@@ -15,6 +15,7 @@ from PIL import Image
 from fd_mitsuba.backend.threads import rendering_threads
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.boundary_step import boundary_step
+from fd_mitsuba.evaluation.clip_loading import BUILTIN_NAME
 from fd_mitsuba.evaluation.judged_views import VIEWS_TOGETHER, JudgedViews, lit_views, shape_views
 from fd_mitsuba.evaluation.protocol import FORMAT, about_views, judged, measured, measured_by_run
 from fd_mitsuba.evaluation.report.score_table import COLUMNS
@@ -77,7 +78,7 @@ def evaluate_run(
     Args:
         rivals: the scenes whose edit prompts the run's own has to be found among. If the built-in models know every
             word of the run's prompt, only the scenes of which that is true count.
-        say: takes a line where the run's scene is gone and its copy is read.
+        say: takes a line where the run's scene is gone and its copy is read, or where the scores say nothing.
         again: also if a result of the same run, judge, protocol and rivals is there already.
 
     Raises:
@@ -103,6 +104,8 @@ def evaluate_run(
         stage = load_finished_stage(scene, config, folder)
         with rendering_threads():
             views = shape_views(stage, protocol.views, protocol.size, 9, _shape_kind(judge))
+    if scene.subtracts and judge.name == BUILTIN_NAME:
+        say(f"{folder}: takes a part off, for which the built-in evaluator has no words: its scores do not count")
     vocabulary = builtin_vocabulary()
     own, simple = _words(scene)
     if vocabulary is not None and not ScenePrompts(scene.path, own, simple).known_to(vocabulary):

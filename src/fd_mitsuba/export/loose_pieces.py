@@ -47,7 +47,9 @@ def bodies(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.unique(label, return_inverse=True)[1].reshape(-1)
 
 
-def loose_pieces(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, others: Sequence[Mesh], removed: float) -> LoosePieces:
+def loose_pieces(
+    vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, others: Sequence[Mesh], removed: float
+) -> LoosePieces:
     """What hangs free of a mesh after a cut.
 
     Args:

@@ -57,7 +57,7 @@ class CaptionWriter:
             body, name: as of `caption`.
             parts: at least one.
         """
-        words = [self._part(part) for part in parts]
+        words = [self._part(part, looks=False) for part in parts]
         return f"{self._body(body, name)} {WITHOUT} {' and '.join(words)}"
 
     def _body(self, group: Group | None, name: str | None) -> str:
@@ -82,7 +82,7 @@ class CaptionWriter:
         nouns = [noun for phrases in self._vocabulary.bodies.values() for noun in phrases]
         return next((noun for noun in self._table.neutral if noun in nouns), nouns[0])
 
-    def _part(self, group: Group) -> str:
+    def _part(self, group: Group, looks: bool = True) -> str:
         phrases = self._vocabulary.parts[group.entry.name]
         self.used |= set(range(group.first, group.behind))
         if group.entry.kind != "part":
@@ -92,16 +92,16 @@ class CaptionWriter:
         kept = []
         for place in group.modifiers:
             text = self._tokens[place].text
-            style = None if place in self._negated else self._table.style_of(text, self._known)
+            style = None if place in self._negated or not looks else self._table.style_of(text, self._known)
             if style is not None or text in own:
                 kept.append(text if style is None else style[0])
                 self.used.add(place)
                 self.styles += [] if style is None else [style[1]]
-        if noun is not None:
+        if noun is not None and looks:
             self.styles += [s[1] for word in noun.split() if (s := self._table.style_of(word, self._known))]
         article = self._article(group, phrases, kept)
         said = [*kept, noun if noun is not None else bare(phrases[0])]
-        behind = [name for _, name in self._made_of(group)]
+        behind = [name for _, name in self._made_of(group)] if looks else []
         self.styles += behind
         if len(behind) == 1 and behind[0] in self._table.materials and {"made", "of", *behind} <= self._known:
             return f"{article}{' '.join(said)} made of {behind[0]}"

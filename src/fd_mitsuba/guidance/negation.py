@@ -48,6 +48,23 @@ def negated_words(tokens: Sequence[Token], parts: Collection[tuple[int, int]], w
     return found
 
 
+def says_no_to_a_no(tokens: Sequence[Token], parts: Collection[tuple[int, int]], words: Negation) -> bool:
+    """Whether one negation follows another before any part is named: "do not remove the horns", "all except its hat".
+
+    Such a prompt may mean the opposite of what `negated_words` makes of it, which is harmless where parts are added.
+    """
+    inside = {place for first, behind in parts for place in range(first, behind)}
+    open_negation = False
+    for place, token in enumerate(tokens):
+        if _starts(tokens, place, words):
+            if open_negation:
+                return True
+            open_negation = True
+        elif place in inside or token.text == ".":
+            open_negation = False
+    return False
+
+
 def _starts(tokens: Sequence[Token], place: int, words: Negation) -> bool:
     text = tokens[place].text
     following = tokens[place + 1].text if place + 1 < len(tokens) else ""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from fd_mitsuba.guidance.caption_writer import CaptionWriter
 from fd_mitsuba.guidance.lexicon import lexicon
-from fd_mitsuba.guidance.negation import negated_words
+from fd_mitsuba.guidance.negation import negated_words, says_no_to_a_no
 from fd_mitsuba.guidance.phrase_groups import Group, find_groups
-from fd_mitsuba.guidance.prompt_subjects import Subjects, find_subjects
+from fd_mitsuba.guidance.prompt_subjects import find_subjects
 from fd_mitsuba.guidance.prompt_tokens import Token, tokens_of
 from fd_mitsuba.guidance.vocabulary import Vocabulary, bare
 from fd_mitsuba.guidance.word_table import WordTable, word_table
@@ -36,6 +36,7 @@ class PromptReading:
     taken_for: the prompt's own word -> the part or body that it was taken for.
     ignored: its words that the model is not told.
     nearest: known part phrases that are spelt most like the prompt's words, best first.
+    doubtful: whether it says no to a no, or both wants and does not want the same part.
     """
 
     parts: tuple[str, ...]
@@ -47,6 +48,7 @@ class PromptReading:
     taken_for: dict[str, str]
     ignored: tuple[str, ...]
     nearest: tuple[str, ...]
+    doubtful: bool = False
 
     def summary(self) -> str:
         """One line: "part: pointed hat; body: rabbit; ignored: cuddly"."""
@@ -82,7 +84,8 @@ def read_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> P
     tokens = tokens_of(prompt)
     groups = find_groups(tokens, lexicon(vocabulary, table), vocabulary, table)
     named = [group for group in groups if group.entry.kind != "body"]
-    negated = negated_words(tokens, [(group.first, group.behind) for group in named], table.negation)
+    places = [(group.first, group.behind) for group in named]
+    negated = negated_words(tokens, places, table.negation)
     removed = {group.entry.name for group in named if group.taken_away or group.first in negated}
     subjects = find_subjects(tokens, groups, removed, table)
     wanted = [group for group in subjects.parts if group.entry.known]
@@ -107,9 +110,20 @@ def read_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> P
         styles=tuple(dict.fromkeys(writer.styles)),
         removed=tuple(sorted(removed)),
         unknown_parts=tuple(group.entry.name for group in subjects.parts if not group.entry.known),
-        taken_for={} if whole else _taken_for(tokens, subjects, vocabulary),
+        taken_for={}
+        if whole
+        else _taken_for(
+            tokens, [*subjects.parts, *(group for group in off if not (wanted or group.taken_away)), subjects.body]
+        ),
         ignored=_ignored(tokens, [*subjects.parts, *known_body, *not_wanted], writer.used, table),
         nearest=_nearest([token.text for token in tokens], vocabulary, table),
+        doubtful=says_no_to_a_no(tokens, places, table.negation)
+        or any(
+            group.entry.kind == "part"
+            and group.entry.name in removed
+            and not (group.taken_away or group.first in negated)
+            for group in named
+        ),
     )
 
 
@@ -125,10 +139,11 @@ def _body_within(parts: Sequence[Group], vocabulary: Vocabulary) -> str | None:
     return next((name for name, nouns in vocabulary.bodies.items() for word in words if word in nouns), None)
 
 
-def _taken_for(tokens: Sequence[Token], subjects: Subjects, vocabulary: Vocabulary) -> dict[str, str]:
-    groups = [*subjects.parts, *([] if subjects.body is None else [subjects.body])]
+def _taken_for(tokens: Sequence[Token], groups: Sequence[Group | None]) -> dict[str, str]:
     found = {}
     for group in groups:
+        if group is None:
+            continue
         said = " ".join(token.text for token in tokens[group.first : group.behind])
         name = group.entry.name
         if group.entry.known and group.entry.phrase is None and said != name:

@@ -50,7 +50,17 @@ def _understood_removal(prompt: str, vocabulary: Vocabulary, base_prompt: str) -
             '"a mug without a handle", or leave mode="subtract" out'
         )
     if not reading.caption:
-        raise UserError(f"prompt {prompt!r}: {_unknown(reading, prompt, vocabulary, base_prompt)}")
+        off = ", ".join(map(repr, (*reading.removed, *reading.ignored)))
+        raise UserError(
+            f"prompt {prompt!r}: takes off no part that the built-in prior knows"
+            + (f", for it does not know {off}" if off else "")
+            + '; say it as in "a mug without a handle" (`fd_mitsuba prior` lists the words)'
+        )
+    if reading.doubtful:
+        raise UserError(
+            f"prompt {prompt!r}: can be read both ways, and regions that subtract would take off "
+            f'{", ".join(reading.removed)}; say plainly what is to go, as in "a mug without a handle"'
+        )
     return reading
 
 

@@ -175,7 +175,8 @@ def _scene_warnings(scene: EditScene, config: RunConfig) -> list[str]:
     if not scene.base_prompt:
         warnings.append("no base_prompt: preservation scores and before/after prompts lack it; describe the base")
     elif scene.base_prompt.casefold() == scene.prompt.casefold():
-        warnings.append("prompt and base_prompt are the same; name in the prompt what to add")
+        wanted = "take off" if scene.subtracts else "add"
+        warnings.append(f"prompt and base_prompt are the same; name in the prompt what to {wanted}")
     if scene.has_light:
         try:
             warnings += check_appearance_inputs(scene)
