@@ -27,10 +27,24 @@ def test_any_other_model_gets_the_papers(model: str) -> None:
     assert misfits(chosen.config) == []
 
 
-def test_a_packed_prior_counts_as_the_built_in_one(tmp_path: Path) -> None:
-    (tmp_path / "fd_mitsuba.json").write_text("{}")
+@pytest.mark.parametrize(
+    "said", ['{"whole_words": true}', '{"vocabulary": {"bodies": {}, "parts": {"wings": ["wings"]}}}']
+)
+def test_a_packed_prior_counts_as_the_built_in_one(tmp_path: Path, said: str) -> None:
+    (tmp_path / "fd_mitsuba.json").write_text(said)
     chosen = settings_for_run(None, [f"guidance.model={tmp_path}"])
     assert chosen.config.geometry.steps == RunConfig.load("quick").geometry.steps
+    assert misfits(chosen.config) == []
+
+
+@pytest.mark.parametrize(
+    "said", ['{"views_together": 8, "prompt_template": "{prompt}"}', "{}", '{"whole_words": false}', "[]", "{"]
+)
+def test_conventions_alone_do_not_make_a_model_small(tmp_path: Path, said: str) -> None:
+    """What docs/real_weights.md has users of multi-view models write."""
+    (tmp_path / "fd_mitsuba.json").write_text(said)
+    chosen = settings_for_run(None, [f"guidance.model={tmp_path}"])
+    assert chosen.config.geometry.steps == RunConfig.load("paper").geometry.steps
     assert misfits(chosen.config) == []
 
 

@@ -10,12 +10,13 @@ from typing import Any
 from fd_mitsuba.config.guidance_section import GuidanceConfig
 from fd_mitsuba.config.run_config import RunConfig
 from fd_mitsuba.config.toml_reading import apply_override, read_toml
+from fd_mitsuba.io.json_object import read_json_object
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"
 BUILTIN, BUILTIN_FINE = "builtin", "builtin-fine"
 """Names of the priors of shapes that are shipped; each goes with a prior of colours of its own."""
 _CONVENTIONS_NAME = "fd_mitsuba.json"
-"""A pipeline folder with this file was made by `prior pack`: a small prior, as the built-in one is."""
+"""In the folder of a prior that `prior pack` made; anyone may write one for views and prompts of another model."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,13 @@ def is_builtin(model: str) -> bool:
 
 def is_small_prior(model: str) -> bool:
     """Whether `guidance.model` is a built-in prior or one that was packed like it."""
-    return is_builtin(model) or (Path(model).expanduser() / _CONVENTIONS_NAME).is_file()
+    return is_builtin(model) or _is_packed(Path(model).expanduser())
+
+
+def _is_packed(folder: Path) -> bool:
+    """As `ModelConventions.is_packed`, which is in a module that imports torch."""
+    said = read_json_object(folder / _CONVENTIONS_NAME) or {}
+    return said.get("whole_words") is True or said.get("vocabulary") is not None
 
 
 def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -> ChosenSettings:
