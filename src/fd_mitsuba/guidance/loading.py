@@ -20,6 +20,7 @@ from fd_mitsuba.guidance.image_prompt import add_image_prompt, asks_for_image_pr
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
     WEIGHTS,
+    check_scheduler,
     check_sizes,
     count_weights,
     latent_side,
@@ -28,7 +29,7 @@ from fd_mitsuba.guidance.layout import (
     weight_files,
 )
 from fd_mitsuba.guidance.learned_words import add_word
-from fd_mitsuba.guidance.lora import add_lora
+from fd_mitsuba.guidance.lora import add_lora, lora_files
 from fd_mitsuba.guidance.memory import BYTES, critic_bytes, require_memory, working_set_bytes
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
 from fd_mitsuba.guidance.multiview import join_views
@@ -82,6 +83,7 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
     configs["unet"] = unet_config(folder / "unet" / "config.json", configs["unet"])
     conventions = multiview_conventions(folder, configs["unet"], read_model_conventions(folder), config)
     check_sizes(folder, configs, conventions)
+    check_scheduler(folder)
     files = {part: weight_files(folder, part) for part in WEIGHTS}
     counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
     with_picture = asks_for_image_prompt(config)
@@ -119,8 +121,8 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
 
 def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     """The components after LoRA files and learned words were added to them."""
-    for path in config.lora:
-        add_lora(Path(path).expanduser(), config.lora_scale, loaded.unet, loaded.text_encoder)
+    for file in lora_files(config.lora):
+        add_lora(file, config.lora_scale, loaded.unet, loaded.text_encoder)
     words = [add_word(Path(path).expanduser(), loaded.tokenizer, loaded.text_encoder) for path in config.words]
     picture = None
     if asks_for_image_prompt(config):
@@ -199,6 +201,7 @@ def _load(
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
         owner = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
         tokenizer = owner.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
+        tokenizer("a")  # one without words is only told as it reads
     known = loaded["text_encoder"].config.vocab_size
     if len(tokenizer) > known:
         raise UserError(
@@ -208,6 +211,8 @@ def _load(
         scheduler = scheduler_class.from_pretrained(str(folder / "scheduler"), local_files_only=True)
     if not hasattr(scheduler, "alphas_cumprod"):
         raise UserError(f"{folder / 'scheduler'}: {index['scheduler'][1]} has no noise levels alphas_cumprod; {LAYOUT}")
+    if not torch.isfinite(scheduler.alphas_cumprod).all():
+        raise UserError(f"{folder / 'scheduler'}: its noise levels are not finite; fetch the model again")
     return Components(tokenizer, loaded["text_encoder"], loaded["unet"], loaded["vae"], scheduler, conventions, folder)
 
 
