@@ -87,6 +87,26 @@ def test_what_does_not_fit_is_said_in_one_line(choice: str, overrides: list[str]
     assert all(text in line for text in named) and "\n" not in line
 
 
+@pytest.mark.parametrize(
+    ("setting", "owner"),
+    [
+        ("lora_scale=0.5", "lora=a.safetensors"),
+        ("image_prompt_scale=0.5", "image_prompt=a.png"),
+        ("controlnet_scale=0", "controlnet=a/b"),
+        ("controlnet_sees=normal", "controlnet=a/b"),
+    ],
+)
+def test_a_setting_of_what_is_not_there_has_no_effect(setting: str, owner: str) -> None:
+    (line,) = misfits(RunConfig.load("paper", [f"guidance.{setting}"]))
+    key, _, value = setting.partition("=")
+    name = owner.partition("=")[0]
+    assert line == f"guidance.{key} = {value}: has no effect without guidance.{name}; give that, too"
+    assert misfits(RunConfig.load("paper", [f"guidance.{setting}", f"guidance.{owner}"])) == []
+    assert len(misfits(RunConfig.load("quick", [f"guidance.{setting}", "guidance.model=a/b"]))) == 2
+    usual = getattr(RunConfig().guidance, key)
+    assert misfits(RunConfig.load("paper", [f"guidance.{key}={usual}"])) == []
+
+
 @pytest.mark.parametrize("choice", ["quick", "paper", "smoke"])
 def test_shipped_settings_fit_their_own_model(choice: str) -> None:
     assert misfits(RunConfig.load(choice)) == []

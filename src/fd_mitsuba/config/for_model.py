@@ -66,24 +66,43 @@ def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -
 
 
 def misfits(config: RunConfig) -> list[str]:
-    """A line that names the settings which do not fit the guidance model; none where all do, or where none is used."""
+    """Lines on settings that do not fit the guidance model or have no effect; none where no model is used."""
     if config.guidance.kind.kind != "diffusion":
         return []
-    small = is_small_prior(config.guidance.model)
     if config.geometry.lambda_sds == 0 and config.appearance.lambda_sds == 0:
         return []
+    idle = _idle(config.guidance)
+    small = is_small_prior(config.guidance.model)
     rules = _SMALL if small else _LARGE
     wrong = [(key, _value(config, key)) for key, fits in rules.items() if not fits(_value(config, key))]
     if config.guidance.variant != GuidanceConfig().variant:  # each variant has a scale of its own
         wrong = [(key, value) for key, value in wrong if key != "guidance.guidance_scale"]
     if not wrong:
-        return []
+        return idle
     preset = SMALL_PRESET if small else LARGE_PRESET
     usual = RunConfig.load(read_toml(preset))
     named = ", ".join(f"{key} = {_text(value)} ({preset}: {_text(_value(usual, key))})" for key, value in wrong)
     whom = _called(config.guidance.model)
     other = "name a Stable Diffusion model in guidance.model" if small else "set guidance.model=builtin"
-    return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}"]
+    return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}", *idle]
+
+
+def _idle(guidance: GuidanceConfig) -> list[str]:
+    """A line for each setting of an addition to the model that is not there."""
+    usual = GuidanceConfig()
+    return [
+        f"guidance.{key} = {_text(getattr(guidance, key))}: has no effect without guidance.{owner}; give that, too"
+        for key, owner in _BELONGS_TO.items()
+        if not getattr(guidance, owner) and getattr(guidance, key) != getattr(usual, key)
+    ]
+
+
+_BELONGS_TO = {
+    "lora_scale": "lora",
+    "image_prompt_scale": "image_prompt",
+    "controlnet_scale": "controlnet",
+    "controlnet_sees": "controlnet",
+}
 
 
 _SMALL: dict[str, Callable[[Any], bool]] = {
