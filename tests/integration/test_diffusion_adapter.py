@@ -485,7 +485,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "weights of another model": (
         lambda f: edit_json(f / "unet/config.json", block_out_channels=[32, 64, 96, 128]),
-        "unet: cannot be loaded",
+        "expected shape torch.Size([96]), but got torch.Size([128])); copy or fetch",
     ),
     "tensor missing": (lambda f: drop_tensor(f / UNET_FILE), "lack 1 tensors, conv_in.weight"),
     "depth": (lambda f: edit_json(f / "unet/config.json", in_channels=5), "in_channels is 5"),
