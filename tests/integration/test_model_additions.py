@@ -230,7 +230,7 @@ def test_words_that_do_not_fit_are_one_line(folder: Path, tmp_path: Path) -> Non
         ({"<x>": torch.zeros(0, 48)}, r"holds no vectors \(0, 48\)"),
         ({"<x>": torch.tensor(1.0)}, r"vectors \(\), but"),
         ({"": torch.zeros(1, 48)}, "its word is ''"),
-        ({"  ": torch.zeros(1, 48)}, "its word is '  '"),
+        ({" ": torch.zeros(1, 48)}, "its word is ' '"),
         ({"<x>": torch.full((1, 48), torch.inf)}, "<x> has values that are not finite"),
     ):
         save_file(content, file)
