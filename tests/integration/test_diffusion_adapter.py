@@ -17,12 +17,13 @@ import torch
 from tiny_guidance import components_of, load
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import builtin, loading, memory
 from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews, NonFiniteGuidance
+from fd_mitsuba.runs.model_check import check_model
 
 KINDS = ("sd15", "sd21", "ip2p", "tiny_vae")
 OF_TWO_STEPS = {"kind": "reconstruction", "steps": 2}
@@ -557,6 +558,23 @@ def test_bad_folder_is_one_line(folders: dict[str, Path], tmp_path: Path, case: 
     message = str(caught.value)
     assert expected in message and str(folder) in message
     assert "\n" not in message and len(message) < 500
+
+
+HEADERS = ("no index", "wrong class", "no weights", "pickle only", "weights cut short", "depth", "grid", "base")
+
+
+@pytest.mark.parametrize("case", HEADERS)
+def test_what_headers_tell_is_told_without_loading(folders: dict[str, Path], tmp_path: Path, case: str) -> None:
+    spoil, expected = BAD[case]
+    folder = shutil.copytree(folders["sd15"], tmp_path / "model")
+    config = RunConfig.load(None, [f"guidance.model={folder}"])
+    check_model(config, True, True)
+    spoil(folder)
+    with pytest.raises(UserError) as told:
+        check_model(config, True, True)
+    with pytest.raises(UserError) as refused:
+        DiffusionGuidance.load(config.guidance)
+    assert str(told.value) == str(refused.value) and expected in str(told.value)
 
 
 @pytest.mark.parametrize(

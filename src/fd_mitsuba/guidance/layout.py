@@ -16,6 +16,7 @@ from fd_mitsuba.guidance.multiview import is_multiview
 LAYOUT = (
     "only Stable Diffusion 1.x/2.x, inpainting, InstructPix2Pix and MVDream layouts work (UNet, one CLIP text encoder)"
 )
+LAYOUT_NAME = "Stable-Diffusion layout"
 WEIGHTS = {
     "unet": "diffusion_pytorch_model",
     "vae": "diffusion_pytorch_model",
