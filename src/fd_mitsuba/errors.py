@@ -13,6 +13,9 @@ _HIDDEN = re.compile(
 _NO_MEMORY = ("allocate memory", "out of memory", "bad_alloc", "bad alloc", "unable to allocate", "size calculation")
 """What NumPy, torch, Dr.Jit and the system say when there is not enough."""
 
+_ADVICE = ". If you want to instead overwrite randomly initialized weights"
+"""How Diffusers' advice to programmers begins, behind its complaint of a tensor's shape."""
+
 
 class UserError(Exception):
     """Bad input: the message is one line that names the file, the element and what to do. Exit code 1."""
@@ -32,7 +35,7 @@ class Interrupted(Exception):
 def first_line(error: BaseException) -> str:
     """The first line of another library's message, or the error's type where it has none."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines[0] if lines else type(error).__name__)[:200]
+    return (lines[0].partition(_ADVICE)[0].strip() if lines else type(error).__name__)[:200]
 
 
 def printable(line: str) -> str:

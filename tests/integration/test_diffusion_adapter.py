@@ -7,6 +7,7 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import diffusers
@@ -16,12 +17,13 @@ import torch
 from tiny_guidance import components_of, load
 from tiny_pipelines import save_pipeline
 
-from fd_mitsuba.config import GuidanceConfig
+from fd_mitsuba.config import GuidanceConfig, RunConfig
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import builtin, loading, memory
 from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews, NonFiniteGuidance
+from fd_mitsuba.runs.model_check import check_model
 
 KINDS = ("sd15", "sd21", "ip2p", "tiny_vae")
 OF_TWO_STEPS = {"kind": "reconstruction", "steps": 2}
@@ -429,6 +431,10 @@ def edit_json(path: Path, **changes: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
+def set_entry(folder: Path, name: str, key: str, value: object) -> None:
+    edit_json(folder / name, **{key: value})
+
+
 def drop_tensor(path: Path) -> None:
     tensors = safetensors.torch.load_file(path)
     tensors.pop("conv_in.weight")
@@ -438,6 +444,17 @@ def drop_tensor(path: Path) -> None:
 def only_pickle(folder: Path) -> None:
     weights = folder / "unet/diffusion_pytorch_model.safetensors"
     weights.rename(weights.with_suffix(".bin"))
+
+
+def spread(folder: Path, places: object) -> None:
+    (folder / UNET_FILE).unlink()
+    (folder / f"{UNET_FILE}.index.json").write_text(json.dumps({"weight_map": places}))
+
+
+def without_words(folder: Path) -> None:
+    (folder / "tokenizer" / "tokenizer.json").unlink(missing_ok=True)
+    (folder / "tokenizer" / "vocab.json").write_text("{}")
+    (folder / "tokenizer" / "merges.txt").write_text("")
 
 
 UNET_FILE = "unet/diffusion_pytorch_model.safetensors"
@@ -469,7 +486,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "weights of another model": (
         lambda f: edit_json(f / "unet/config.json", block_out_channels=[32, 64, 96, 128]),
-        "unet: cannot be loaded",
+        "expected shape torch.Size([96]), but got torch.Size([128])); copy or fetch",
     ),
     "tensor missing": (lambda f: drop_tensor(f / UNET_FILE), "lack 1 tensors, conv_in.weight"),
     "depth": (lambda f: edit_json(f / "unet/config.json", in_channels=5), "in_channels is 5"),
@@ -497,6 +514,11 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         "tokenizer: has neither",
     ),
     "tokenizer of another model": (lambda f: edit_json(f / "text_encoder/config.json", vocab_size=9), "text_encoder"),
+    "tokenizer without words": (without_words, "tokenizer: "),
+    "class a list": (lambda f: edit_json(f / "model_index.json", unet=["diffusers", ["x"]]), "has no unet"),
+    "class a number": (lambda f: edit_json(f / "model_index.json", scheduler=["diffusers", 5]), "has no scheduler"),
+    "class a text": (lambda f: edit_json(f / "model_index.json", scheduler=["diffusers", "__doc__"]), "scheduler"),
+    "nested deeply": (lambda f: (f / "model_index.json").write_text("[" * 99_999), "not readable JSON"),
     "conventions": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_gird": 2}'), "fd_mitsuba.json: view_gird"),
     "grid": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_grid": 3}'), "does not divide"),
     "base": (lambda f: (f / "fd_mitsuba.json").write_text('{"needs_base": true}'), "4 input channels"),
@@ -504,6 +526,25 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "fd_mitsuba.json").write_text('{"predicts": "difference"}'),
         "fd_mitsuba.json: predicts difference",
     ),
+}
+
+
+BAD |= {
+    f"weight_map {places!r}": (partial(spread, places=places), "index.json: its weight_map does not say")
+    for places in (None, {}, ["a"], {"a": 5})
+}
+BAD |= {
+    f"{name} {key} {value!r}": (partial(set_entry, name=name, key=key, value=value), f"{name}: {key} is {value!r}")
+    for name, key, values in (
+        ("unet/config.json", "sample_size", (3.5, {"a": 1}, -8, "64", [16], [16, "x"], True)),
+        ("unet/config.json", "block_out_channels", ("big", [], [32, "x"], [0, 32], 5)),
+        ("vae/config.json", "block_out_channels", ("big", [], [[8]])),
+        ("vae/config.json", "layers_per_block", ("two", 0, None)),
+        ("vae/config.json", "scaling_factor", ("x", None, 0.0, -1, float("nan"), float("inf"))),
+        ("vae/config.json", "shift_factor", ("x", float("nan"))),
+        ("scheduler/scheduler_config.json", "num_train_timesteps", (1, 0, -5, 2.5, "x", None)),
+    )
+    for value in values
 }
 
 
@@ -517,6 +558,23 @@ def test_bad_folder_is_one_line(folders: dict[str, Path], tmp_path: Path, case: 
     message = str(caught.value)
     assert expected in message and str(folder) in message
     assert "\n" not in message and len(message) < 500
+
+
+HEADERS = ("no index", "wrong class", "no weights", "pickle only", "weights cut short", "depth", "grid", "base")
+
+
+@pytest.mark.parametrize("case", HEADERS)
+def test_what_headers_tell_is_told_without_loading(folders: dict[str, Path], tmp_path: Path, case: str) -> None:
+    spoil, expected = BAD[case]
+    folder = shutil.copytree(folders["sd15"], tmp_path / "model")
+    config = RunConfig.load(None, [f"guidance.model={folder}"])
+    check_model(config, True, True)
+    spoil(folder)
+    with pytest.raises(UserError) as told:
+        check_model(config, True, True)
+    with pytest.raises(UserError) as refused:
+        DiffusionGuidance.load(config.guidance)
+    assert str(told.value) == str(refused.value) and expected in str(told.value)
 
 
 @pytest.mark.parametrize(

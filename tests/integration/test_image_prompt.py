@@ -160,6 +160,18 @@ BAD: dict[str, tuple[Callable[[Path, Path], dict[str, object]], str]] = {
         lambda root, folder: changed(root, folder, lambda t: t.pop("ip_adapter.3.to_k_ip.weight")),
         "cannot be put into the model",
     ),
+    "no matrix": (
+        lambda root, folder: changed(root, folder, lambda t: t.update({"image_proj.proj.weight": torch.ones(SAID)})),
+        "image_proj.norm.weight (48,) and proj.weight (24,) are no vector and no matrix",
+    ),
+    "no vector": (
+        lambda root, folder: changed(root, folder, lambda t: t.update({"image_proj.norm.weight": torch.tensor(1.0)})),
+        "image_proj.norm.weight () and",
+    ),
+    "nan": (
+        lambda root, folder: changed(root, folder, lambda t: t["ip_adapter.1.to_k_ip.weight"].fill_(torch.nan)),
+        "ip_adapter.1.to_k_ip.weight has values that are not finite",
+    ),
     "builtin": (lambda root, folder: {"model": "builtin"}, "made for Stable Diffusion"),
 }
 

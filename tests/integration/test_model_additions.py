@@ -118,6 +118,10 @@ def wide(down: Tensor, up: Tensor) -> dict[str, Tensor]:
     return dict(zip(peft("unet", ATTENTION), (torch.cat([down, down], 1), up), strict=True))
 
 
+def pair(down: Tensor, up: Tensor) -> dict[str, Tensor]:
+    return dict(zip(peft("unet", ATTENTION), (down.contiguous(), up.contiguous()), strict=True))
+
+
 BAD: dict[str, tuple[Callable[[Tensor, Tensor], dict[str, Tensor]], str]] = {
     "other widths": (wide, r"matrices \(3, 64\) and \(32, 3\) for a weight \(32, 32\); it was made for another one"),
     "other layers": (
@@ -135,6 +139,15 @@ BAD: dict[str, tuple[Callable[[Tensor, Tensor], dict[str, Tensor]], str]] = {
     "a whole model": (lambda down, up: {"conv_in.weight": down}, "conv_in.weight is no part of a plain LoRA"),
     "sdxl": (lambda down, up: {"lora_te2_x.lora_down.weight": down}, "no part of a plain LoRA"),
     "empty": (lambda down, up: {}, "holds no LoRA"),
+    "rank 0": (lambda down, up: pair(down[:0], up[:, :0]), r"\(0, 32\) and \(32, 0\) are no two matrices of a rank"),
+    "vectors": (lambda down, up: pair(down[0], up[:, 0]), r"\(32,\) and \(32,\) are no two matrices"),
+    "numbers": (lambda down, up: pair(torch.tensor(1.0), torch.tensor(2.0)), r"\(\) and \(\) are no two matrices"),
+    "three alphas": (lambda down, up: {"lora_unet_x.alpha": torch.ones(3)}, "lora_unet_x.alpha has 3 values, not one"),
+    "nan": (lambda down, up: pair(down / 0, up), "lora_A.weight has values that are not finite"),
+    "infinite alpha": (
+        lambda down, up: {"lora_unet_x.alpha": torch.tensor(float("inf"))},
+        "lora_unet_x.alpha has values that are not finite",
+    ),
 }
 
 
@@ -146,6 +159,34 @@ def test_a_lora_that_does_not_fit_is_one_line(folder: Path, matrices: dict, tmp_
     with pytest.raises(UserError, match=expected) as caught:
         load(folder, lora=(str(file),))
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("[1]", "lora_adapter_metadata is no JSON object"),
+        ("[" * 99_999, "lora_adapter_metadata is not JSON"),
+        ('{"unet.lora_alpha": "big"}', "its unet.lora_alpha is 'big', not a finite number"),
+        ('{"unet.lora_alpha": null}', "its unet.lora_alpha is None"),
+        ('{"unet.lora_alpha": true}', "its unet.lora_alpha is True"),
+        ('{"text_encoder.lora_alpha": NaN}', "its text_encoder.lora_alpha is nan"),
+    ],
+)
+def test_settings_of_an_adapter_that_say_nothing(
+    folder: Path, matrices: dict, tmp_path: Path, said: str, expected: str
+) -> None:
+    file = tmp_path / "a.safetensors"
+    save_file(pair(*matrices["unet", ATTENTION]), file, metadata={"lora_adapter_metadata": said})
+    with pytest.raises(UserError, match=expected) as caught:
+        load(folder, lora=(str(file),))
+    assert str(file) in str(caught.value)
+
+
+def test_a_lora_is_added_once(folder: Path, matrices: dict, tmp_path: Path) -> None:
+    file = tmp_path / "a.safetensors"
+    save_file(pair(*matrices["unet", ATTENTION]), file)
+    with pytest.raises(UserError, match="is named twice in guidance.lora"):
+        load(folder, lora=(str(file), str(tmp_path)))
 
 
 def test_files_that_are_no_lora(folder: Path, tmp_path: Path) -> None:
@@ -186,6 +227,11 @@ def test_words_that_do_not_fit_are_one_line(folder: Path, tmp_path: Path) -> Non
         ({"<x>": torch.zeros(1, 64)}, r"vectors \(1, 64\), but this model's words have 48 numbers"),
         ({"horse</w>": torch.zeros(1, 48)}, "knows 'horse</w>' already"),
         ({"<x>": torch.zeros(1, 48), "<y>": torch.zeros(1, 48)}, "holds 2 tensors"),
+        ({"<x>": torch.zeros(0, 48)}, r"holds no vectors \(0, 48\)"),
+        ({"<x>": torch.tensor(1.0)}, r"vectors \(\), but"),
+        ({"": torch.zeros(1, 48)}, "its word is ''"),
+        ({" ": torch.zeros(1, 48)}, "its word is ' '"),
+        ({"<x>": torch.full((1, 48), torch.inf)}, "<x> has values that are not finite"),
     ):
         save_file(content, file)
         with pytest.raises(UserError, match=expected):

@@ -297,6 +297,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "inpainting": (lambda f: edit(f / UNET, in_channels=9), "is told cameras and has 9 input channels"),
     "more layers": (lambda f: edit(f / UNET, num_res_blocks=2), "the config asks for"),
     "other widths": (lambda f: edit(f / UNET, model_channels=64), "unet: cannot be loaded"),
+    "no side": (lambda f: edit(f / UNET, image_size="x"), "image_size is 'x', not a whole number above 0"),
+    "no channels": (lambda f: edit(f / UNET, model_channels=0), "entries are not those"),
     "mosaics": (lambda f: (f / "fd_mitsuba.json").write_text('{"view_grid": 2}'), "see no mosaics"),
     "pickled": (
         lambda f: (f / "unet/diffusion_pytorch_model.safetensors").rename(f / "unet/model.bin"),

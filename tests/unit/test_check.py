@@ -143,6 +143,25 @@ def test_a_prompt_that_a_run_refuses_is_refused(
     assert ("subtract" in told.err) == ("without" in prompt)
 
 
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (["guidance.model=no-such-folder"], "no-such-folder: no such folder"),
+        (["guidance.lora=a.safetensors"], "made for Stable Diffusion"),
+        (["guidance.model=a/b", "guidance.lora=a.safetensors"], "a.safetensors: no such file or folder"),
+        (["guidance.model=a/b", "guidance.image_prompt=a.png"], "guidance.ip_adapter: is missing"),
+        (["guidance.model=a/b", "guidance.variant=vsd", "guidance.dtype=float16"], "too small for float16"),
+        (["guidance.model=a/b", "guidance.variant=csd", "guidance.perp_neg=1"], "csd makes no use of it"),
+    ],
+)
+def test_a_model_that_a_run_refuses_is_refused(make_scene: Make, settings: list[str], expected: str) -> None:
+    scene = load_edit_scene(make_scene(integrator=_with_prompt("a rabbit with a hat")))
+    refusal = check_scene(scene, RunConfig.load(None, settings)).refusal
+    assert refusal is not None and expected in refusal and "\n" not in refusal
+    unused = [*settings, "geometry.lambda_sds=0", "appearance.lambda_sds=0"]
+    assert check_scene(scene, RunConfig.load(None, unused)).refusal is None
+
+
 def test_a_cut_that_a_run_refuses_is_refused(make_scene: Make) -> None:
     cut = ball("0.15", 0, 0.3, 0).replace("<transform", '<string name="mode" value="subtract"/><transform')
     scene = load_edit_scene(make_scene(region=cut))

@@ -201,6 +201,17 @@ def test_bad_guidance_is_one_line(override: str, expected: str) -> None:
     assert expected in message and f"--set guidance.{override}" in message
 
 
+@pytest.mark.parametrize("key", ["lora", "words"])
+def test_one_file_needs_no_brackets(key: str, tmp_path: Path) -> None:
+    alone, listed = (
+        RunConfig.load(None, [f"guidance.{key}={value}"]) for value in ("a.safetensors", '["a.safetensors"]')
+    )
+    assert getattr(alone.guidance, key) == ("a.safetensors",) and alone.content_hash() == listed.content_hash()
+    (tmp_path / "a.toml").write_text(f'guidance.{key} = "a.safetensors"')
+    assert RunConfig.load(tmp_path / "a.toml").guidance == alone.guidance
+    assert f"guidance.{key}" in refusal(None, f"guidance.{key}=3")
+
+
 def test_hash_follows_every_setting() -> None:
     overrides = ["seed=1", "geometry.steps=7", "guidance.model=x", "guidance.dtype=bfloat16", "cameras.aim=object"]
     hashes = [RunConfig.load(None, [override]).content_hash() for override in overrides]

@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.runs.network_size import NetworkSize, network_size
 
 
@@ -32,6 +33,14 @@ def test_weights_are_counted_in_any_precision_whatever_the_file_is_called(tmp_pa
     found = network_size(folder_with(tmp_path / "model", [tensors], sample_size=96, in_channels=8))
     assert (found.weights, found.latent_size, found.has_image_pass) == (3005, 96, True)
     assert str(tmp_path / "model" / "unet") in found.source
+
+
+def test_a_folder_may_be_at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder_with(tmp_path / "model", [{"a": torch.zeros(700)}])
+    (tmp_path / "model" / "fd_mitsuba.json").write_text('{"vocabulary": {"bodies": {}, "parts": {"wings": ["wings"]}}}')
+    vocabulary = vocabulary_of("~/model")
+    assert network_size("~/model").weights == 700 and vocabulary is not None and "wings" in vocabulary.parts
 
 
 def test_shards_are_added_up(tmp_path: Path) -> None:

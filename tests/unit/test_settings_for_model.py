@@ -27,10 +27,24 @@ def test_any_other_model_gets_the_papers(model: str) -> None:
     assert misfits(chosen.config) == []
 
 
-def test_a_packed_prior_counts_as_the_built_in_one(tmp_path: Path) -> None:
-    (tmp_path / "fd_mitsuba.json").write_text("{}")
+@pytest.mark.parametrize(
+    "said", ['{"whole_words": true}', '{"vocabulary": {"bodies": {}, "parts": {"wings": ["wings"]}}}']
+)
+def test_a_packed_prior_counts_as_the_built_in_one(tmp_path: Path, said: str) -> None:
+    (tmp_path / "fd_mitsuba.json").write_text(said)
     chosen = settings_for_run(None, [f"guidance.model={tmp_path}"])
     assert chosen.config.geometry.steps == RunConfig.load("quick").geometry.steps
+    assert misfits(chosen.config) == []
+
+
+@pytest.mark.parametrize(
+    "said", ['{"views_together": 8, "prompt_template": "{prompt}"}', "{}", '{"whole_words": false}', "[]", "{"]
+)
+def test_conventions_alone_do_not_make_a_model_small(tmp_path: Path, said: str) -> None:
+    """What docs/real_weights.md has users of multi-view models write."""
+    (tmp_path / "fd_mitsuba.json").write_text(said)
+    chosen = settings_for_run(None, [f"guidance.model={tmp_path}"])
+    assert chosen.config.geometry.steps == RunConfig.load("paper").geometry.steps
     assert misfits(chosen.config) == []
 
 
@@ -71,6 +85,26 @@ def test_a_dict_is_taken_and_left_as_it_is() -> None:
 def test_what_does_not_fit_is_said_in_one_line(choice: str, overrides: list[str], named: tuple[str, ...]) -> None:
     (line,) = misfits(RunConfig.load(choice, overrides))
     assert all(text in line for text in named) and "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("setting", "owner"),
+    [
+        ("lora_scale=0.5", "lora=a.safetensors"),
+        ("image_prompt_scale=0.5", "image_prompt=a.png"),
+        ("controlnet_scale=0", "controlnet=a/b"),
+        ("controlnet_sees=normal", "controlnet=a/b"),
+    ],
+)
+def test_a_setting_of_what_is_not_there_has_no_effect(setting: str, owner: str) -> None:
+    (line,) = misfits(RunConfig.load("paper", [f"guidance.{setting}"]))
+    key, _, value = setting.partition("=")
+    name = owner.partition("=")[0]
+    assert line == f"guidance.{key} = {value}: has no effect without guidance.{name}; give that, too"
+    assert misfits(RunConfig.load("paper", [f"guidance.{setting}", f"guidance.{owner}"])) == []
+    assert len(misfits(RunConfig.load("quick", [f"guidance.{setting}", "guidance.model=a/b"]))) == 2
+    usual = getattr(RunConfig().guidance, key)
+    assert misfits(RunConfig.load("paper", [f"guidance.{key}={usual}"])) == []
 
 
 @pytest.mark.parametrize("choice", ["quick", "paper", "smoke"])

@@ -10,12 +10,13 @@ from typing import Any
 from fd_mitsuba.config.guidance_section import GuidanceConfig
 from fd_mitsuba.config.run_config import RunConfig
 from fd_mitsuba.config.toml_reading import apply_override, read_toml
+from fd_mitsuba.io.json_object import read_json_object
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"
 BUILTIN, BUILTIN_FINE = "builtin", "builtin-fine"
 """Names of the priors of shapes that are shipped; each goes with a prior of colours of its own."""
 _CONVENTIONS_NAME = "fd_mitsuba.json"
-"""A pipeline folder with this file was made by `prior pack`: a small prior, as the built-in one is."""
+"""In the folder of a prior that `prior pack` made; anyone may write one for views and prompts of another model."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,13 @@ def is_builtin(model: str) -> bool:
 
 def is_small_prior(model: str) -> bool:
     """Whether `guidance.model` is a built-in prior or one that was packed like it."""
-    return is_builtin(model) or (Path(model).expanduser() / _CONVENTIONS_NAME).is_file()
+    return is_builtin(model) or _is_packed(Path(model).expanduser())
+
+
+def _is_packed(folder: Path) -> bool:
+    """As `ModelConventions.is_packed`, which is in a module that imports torch."""
+    said = read_json_object(folder / _CONVENTIONS_NAME) or {}
+    return said.get("whole_words") is True or said.get("vocabulary") is not None
 
 
 def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -> ChosenSettings:
@@ -59,24 +66,43 @@ def settings_for_run(choice: Path | str | None, overrides: Sequence[str] = ()) -
 
 
 def misfits(config: RunConfig) -> list[str]:
-    """A line that names the settings which do not fit the guidance model; none where all do, or where none is used."""
+    """Lines on settings that do not fit the guidance model or have no effect; none where no model is used."""
     if config.guidance.kind.kind != "diffusion":
         return []
-    small = is_small_prior(config.guidance.model)
     if config.geometry.lambda_sds == 0 and config.appearance.lambda_sds == 0:
         return []
+    idle = _idle(config.guidance)
+    small = is_small_prior(config.guidance.model)
     rules = _SMALL if small else _LARGE
     wrong = [(key, _value(config, key)) for key, fits in rules.items() if not fits(_value(config, key))]
     if config.guidance.variant != GuidanceConfig().variant:  # each variant has a scale of its own
         wrong = [(key, value) for key, value in wrong if key != "guidance.guidance_scale"]
     if not wrong:
-        return []
+        return idle
     preset = SMALL_PRESET if small else LARGE_PRESET
     usual = RunConfig.load(read_toml(preset))
     named = ", ".join(f"{key} = {_text(value)} ({preset}: {_text(_value(usual, key))})" for key, value in wrong)
     whom = _called(config.guidance.model)
     other = "name a Stable Diffusion model in guidance.model" if small else "set guidance.model=builtin"
-    return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}"]
+    return [f"settings that do not fit {whom}: {named}; use -c {preset}, or {other}", *idle]
+
+
+def _idle(guidance: GuidanceConfig) -> list[str]:
+    """A line for each setting of an addition to the model that is not there."""
+    usual = GuidanceConfig()
+    return [
+        f"guidance.{key} = {_text(getattr(guidance, key))}: has no effect without guidance.{owner}; give that, too"
+        for key, owner in _BELONGS_TO.items()
+        if not getattr(guidance, owner) and getattr(guidance, key) != getattr(usual, key)
+    ]
+
+
+_BELONGS_TO = {
+    "lora_scale": "lora",
+    "image_prompt_scale": "image_prompt",
+    "controlnet_scale": "controlnet",
+    "controlnet_sees": "controlnet",
+}
 
 
 _SMALL: dict[str, Callable[[Any], bool]] = {

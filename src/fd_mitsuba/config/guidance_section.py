@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from fd_mitsuba.config.bounds import GuidanceScale, ModelName, Range, Views, Weight
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.identity import MAY_CHANGE
 from fd_mitsuba.config.section import Section
 from fd_mitsuba.conventions import NormalAugmentation, Weighting
+
+
+def _as_list(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+_Files = Annotated[tuple[ModelName, ...], BeforeValidator(_as_list)]
+"""Paths; one alone needs no brackets."""
 
 
 class GuidanceConfig(Section):
@@ -20,11 +28,11 @@ class GuidanceConfig(Section):
     """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
     model: ModelName = "builtin"
     """`builtin`, `builtin-fine`, a folder in Stable-Diffusion layout, or a hub id."""
-    lora: tuple[ModelName, ...] = ()
+    lora: _Files = ()
     """LoRA files (.safetensors), or folders with one each, added to the model's weights."""
     lora_scale: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)] = 1.0
     """How much of each is added."""
-    words: tuple[ModelName, ...] = ()
+    words: _Files = ()
     """Learned words for prompts (textual inversion): .safetensors files, or folders with one each."""
     image_prompt: ModelName = ""
     """A picture that the material is to resemble, beside the prompt; appearance stage, through an IP-Adapter."""

@@ -14,10 +14,14 @@ _SHARED = ("cross_attention_dim", "block_out_channels", "down_block_types")
 """What a ControlNet has in common with the UNet that it was made for."""
 
 
+def local_controlnet(model: str) -> Path | None:
+    """The folder that `guidance.controlnet` is; None where it is a hub id."""
+    return local_folder(model, "guidance.controlnet", "a ControlNet's layout")
+
+
 def locate_controlnet(model: str) -> Path:
     """The folder of `guidance.controlnet`: itself, or a snapshot of a hub id."""
-    folder = local_folder(model, "guidance.controlnet", "a ControlNet's layout")
-    return folder or hub_snapshot(model, ["config.json", f"{_STEM}*.safetensors*"], ["*.fp16.*"])
+    return local_controlnet(model) or hub_snapshot(model, ["config.json", f"{_STEM}*.safetensors*"], ["*.fp16.*"])
 
 
 def check_controlnet(folder: Path, unet: dict[str, Any]) -> tuple[int, str | None]:

@@ -18,7 +18,6 @@ from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.conventions import NormalSpace
-from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.conditions import Conditions
 from fd_mitsuba.guidance.critic import Critic
@@ -36,7 +35,7 @@ from fd_mitsuba.guidance.prompts import TextEmbeddings
 from fd_mitsuba.guidance.query import Distillation, timestep_range
 from fd_mitsuba.guidance.scene_texts import SceneTexts
 from fd_mitsuba.guidance.step_draws import StepDraws, own_share, step_generator
-from fd_mitsuba.guidance.variants import VARIANTS, VariationalScore
+from fd_mitsuba.guidance.variants import VARIANTS, VariationalScore, refuse_conflicts
 
 MASK_THRESHOLD = 0.1
 """A latent cell counts as the part's when the part covers at least this share of it."""
@@ -62,10 +61,7 @@ class DiffusionGuidance(Denoiser):
         self.appearance = appearance or AppearanceConfig()
         self.variant = VARIANTS.make(config.variant, "guidance.variant")
         self.conventions = components.conventions
-        if config.perp_neg and "guided" not in self.variant.passes:
-            raise UserError(
-                f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
-            )
+        refuse_conflicts(config)
         self.critic = self._make_critic()
         self.view_grid = components.conventions.view_grid
         self.normal_space: NormalSpace | None = components.conventions.normal_space
@@ -86,11 +82,6 @@ class DiffusionGuidance(Denoiser):
     def _make_critic(self) -> Critic | None:
         if not isinstance(self.variant, VariationalScore):
             return None
-        if self.config.dtype == "float16":
-            raise UserError(
-                "guidance.variant = vsd: what its critic learns is too small for float16; set guidance.dtype to "
-                "bfloat16 or float32"
-            )
         own = self.variant.settings
         return Critic(self.components.unet, own.rank, own.learning_rate)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError, first_line
 from fd_mitsuba.guidance.layout import read_json
-from fd_mitsuba.guidance.lora import lora_file
+from fd_mitsuba.guidance.lora import lora_file, refuse_non_finite
 
 _PLAIN = ("proj.weight", "proj.bias", "norm.weight", "norm.bias")
 """How a plain adapter turns a picture into words: a linear layer and a norm. "Plus" adapters have more."""
@@ -101,13 +101,20 @@ def _checked(file: Path, unet: Any, encoder: Any) -> dict[str, dict[str, Tensor]
                 group, _, name = key.partition(".")
                 if group in state:
                     state[group][name] = tensors.get_tensor(key)
+                    refuse_non_finite(file, key, state[group][name])
     except (SafetensorError, OSError) as error:
         raise UserError(f"{file}: damaged ({first_line(error)}); fetch the file again") from None
     if sorted(state["image_proj"]) != sorted(_PLAIN):
         raise UserError(
             f"{file}: is no plain IP-Adapter (plus, full and face adapters are not read); take another file"
         )
-    width, seen = state["image_proj"]["norm.weight"].shape[0], state["image_proj"]["proj.weight"].shape[1]
+    norm, projection = state["image_proj"]["norm.weight"], state["image_proj"]["proj.weight"]
+    if norm.ndim != 1 or projection.ndim != 2:
+        raise UserError(
+            f"{file}: image_proj.norm.weight {tuple(norm.shape)} and proj.weight {tuple(projection.shape)} are no "
+            "vector and no matrix; fetch the file again"
+        )
+    width, seen = norm.shape[0], projection.shape[1]
     if width != unet.config.cross_attention_dim:
         raise UserError(
             f"{file}: its words have {width} numbers, the model's {unet.config.cross_attention_dim}; take an adapter "

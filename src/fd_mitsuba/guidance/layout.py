@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from fd_mitsuba.guidance.multiview import is_multiview
 LAYOUT = (
     "only Stable Diffusion 1.x/2.x, inpainting, InstructPix2Pix and MVDream layouts work (UNet, one CLIP text encoder)"
 )
+LAYOUT_NAME = "Stable-Diffusion layout"
 WEIGHTS = {
     "unet": "diffusion_pytorch_model",
     "vae": "diffusion_pytorch_model",
@@ -47,7 +49,7 @@ def read_layout(folder: Path) -> dict[str, Any]:
     for part, classes in CLASSES.items():
         entry = index.get(part)
         found = entry[1] if isinstance(entry, list) and len(entry) == 2 else None
-        if found is None:
+        if not isinstance(found, str):
             raise UserError(f"{path}: the pipeline {name} has no {part}; {LAYOUT}")
         if classes is not None and found not in classes:
             raise UserError(f"{path}: {part} is a {found}, not a {' or '.join(sorted(classes))}; {LAYOUT}")
@@ -77,7 +79,7 @@ def weight_files(folder: Path, part: str, stem: str | None = None) -> tuple[list
         if (folder / part / name).is_file():
             return [folder / part / name], variant
         if (folder / part / listing).is_file():
-            shards = sorted(set(read_json(folder / part / listing).get("weight_map", {}).values()))
+            shards = _shards(folder / part / listing)
             missing = [shard for shard in shards if not (folder / part / shard).is_file()]
             if missing:
                 raise UserError(f"{folder / part / missing[0]}: missing from the pipeline folder; fetch it again")
@@ -87,6 +89,14 @@ def weight_files(folder: Path, part: str, stem: str | None = None) -> tuple[list
             f"{folder / part}: has pickled weights only, which can run code; convert them to {stem}.safetensors"
         )
     raise UserError(f"{folder / part / stem}.safetensors: missing from the pipeline folder; fetch the model again")
+
+
+def _shards(listing: Path) -> list[str]:
+    """The files that a component's weights are spread over."""
+    places = read_json(listing).get("weight_map")
+    if not isinstance(places, dict) or not places or not all(isinstance(name, str) for name in places.values()):
+        raise UserError(f"{listing}: its weight_map does not say which file each tensor is in; fetch the file again")
+    return sorted(set(places.values()))
 
 
 def count_weights(path: Path) -> int:
@@ -107,9 +117,56 @@ def count_weights(path: Path) -> int:
 
 
 def latent_side(unet_config: dict[str, Any]) -> int:
-    """Side of the latents the UNet was trained at; a UNet that does not say is taken for 64."""
+    """Side of the latents the UNet was trained at; a UNet that does not say is taken for 64. See `check_sizes`."""
     size = unet_config.get("sample_size") or 64
     return int(size if isinstance(size, int) else size[0])
+
+
+def check_square(path: Path, config: dict[str, Any], key: str) -> None:
+    """UserError where the side of a config's pictures is no whole number above 0, nor a pair of equal ones."""
+    size = config.get(key) or 64
+    sides = size if isinstance(size, list | tuple) else [size, size]
+    if len(sides) != 2 or not all(_is_whole(side) for side in sides):
+        raise UserError(f"{path}: {key} is {size!r}, not a whole number above 0; fetch the file again")
+    if sides[0] != sides[1]:
+        raise UserError(f"{path}: {key} {size} is not square; take a model with square pictures")
+
+
+def _is_whole(value: Any, least: int = 1) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value < 1 << 31
+
+
+def _check_counts(path: Path, config: dict[str, Any], key: str, least: int = 1) -> None:
+    """UserError where a config's list of whole numbers, if it has it, is another thing."""
+    counts = config.get(key)
+    if counts is None:
+        return
+    if not isinstance(counts, list | tuple) or not counts or not all(_is_whole(count, least) for count in counts):
+        raise UserError(f"{path}: {key} is {counts!r}, not a list of whole numbers; fetch the file again")
+
+
+def _check_vae(path: Path, vae: dict[str, Any]) -> None:
+    for key in ("block_out_channels", "encoder_block_out_channels"):
+        _check_counts(path, vae, key)
+    _check_counts(path, vae, "num_encoder_blocks", least=0)
+    if not _is_whole(vae.get("layers_per_block", 2)):
+        raise UserError(
+            f"{path}: layers_per_block is {vae['layers_per_block']!r}, not a whole number above 0; fetch the file again"
+        )
+    for key, usual in (("scaling_factor", 1.0), ("shift_factor", 0.0)):
+        value = usual if key == "shift_factor" and vae.get(key) is None else vae.get(key, usual)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or (key == "scaling_factor" and value <= 0):
+            wanted = "a number above 0" if key == "scaling_factor" else "a finite number"
+            raise UserError(f"{path}: {key} is {value!r}, not {wanted}; fetch the file again")
+
+
+def check_scheduler(folder: Path) -> None:
+    """UserError where a pipeline's schedule has not two timesteps, between which noise is drawn."""
+    path = folder / "scheduler" / "scheduler_config.json"
+    count = read_json(path).get("num_train_timesteps", 1000)
+    if not _is_whole(count, 2):
+        raise UserError(f"{path}: num_train_timesteps is {count!r}, not a whole number above 1; fetch the file again")
 
 
 def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: ModelConventions) -> None:
@@ -122,8 +179,9 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
         )
     if latent != 4 or unet.get("out_channels", 4) != 4:
         raise UserError(f"{path}: UNet and VAE must share 4 latent channels; take a Stable Diffusion 1.x/2.x model")
-    if not isinstance(unet.get("sample_size") or 64, int) and len(set(unet["sample_size"])) != 1:
-        raise UserError(f"{path}: sample_size {unet['sample_size']} is not square; take a model with square pictures")
+    check_square(path, unet, "sample_size")
+    _check_counts(path, unet, "block_out_channels")
+    _check_vae(folder / "vae" / "config.json", vae)
     if unet.get("time_cond_proj_dim") is not None:
         raise UserError(
             f"{path}: time_cond_proj_dim = {unet['time_cond_proj_dim']!r}: a latent consistency model, which was "
@@ -152,7 +210,7 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
 def read_json(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not readable JSON ({first_line(error)}); copy or fetch the file again") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: must hold a JSON object; copy or fetch the file again")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fd_mitsuba.errors import UserError, first_line
-from fd_mitsuba.guidance.lora import lora_file
+from fd_mitsuba.guidance.lora import lora_file, refuse_non_finite
 
 _UNNAMED = "emb_params"
 """The key of files that other programs write; the file's name is the word then."""
@@ -26,7 +26,12 @@ def add_word(path: Path, tokenizer: Any, text_encoder: Any) -> tuple[str, str]:
     """
     file = lora_file(path, "guidance.words")
     word, vectors = _read(file)
+    if not word.strip():
+        raise UserError(f"{file}: its word is {word!r}; name the tensor in the file after the word")
+    refuse_non_finite(file, word, vectors)
     width = text_encoder.get_input_embeddings().weight.shape[1]
+    if not vectors.numel():
+        raise UserError(f"{file}: holds no vectors {tuple(vectors.shape)}; fetch the file again")
     if vectors.ndim != 2 or vectors.shape[1] != width:
         raise UserError(
             f"{file}: vectors {tuple(vectors.shape)}, but this model's words have {width} numbers; take an embedding "
@@ -53,8 +58,12 @@ def _read(file: Path) -> tuple[str, Tensor]:
     except (SafetensorError, OSError) as error:
         raise UserError(f"{file}: damaged ({first_line(error)}); fetch the file again") from None
     if _UNNAMED in content:
-        return file.stem, content[_UNNAMED]
+        return file.stem, _rows(content[_UNNAMED])
     if len(content) != 1:
         raise UserError(f"{file}: holds {len(content)} tensors, not the vectors of one word; take an embedding")
     ((word, vectors),) = content.items()
-    return word, vectors.view(1, -1) if vectors.ndim == 1 else vectors
+    return word, _rows(vectors)
+
+
+def _rows(vectors: Tensor) -> Tensor:
+    return vectors.view(1, -1) if vectors.ndim == 1 else vectors

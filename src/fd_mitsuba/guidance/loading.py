@@ -12,27 +12,23 @@ import torch
 
 from fd_mitsuba.backend.collector import uncollected
 from fd_mitsuba.config import GuidanceConfig
-from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.errors import UserError, first_line, out_of_memory
 from fd_mitsuba.guidance.builtin import builtin_folder, shipped_folder
 from fd_mitsuba.guidance.control import check_controlnet, locate_controlnet
 from fd_mitsuba.guidance.image_prompt import add_image_prompt, asks_for_image_prompt
 from fd_mitsuba.guidance.layout import (
     LAYOUT,
+    LAYOUT_NAME,
     WEIGHTS,
-    check_sizes,
-    count_weights,
     latent_side,
-    read_json,
-    read_layout,
-    weight_files,
 )
 from fd_mitsuba.guidance.learned_words import add_word
-from fd_mitsuba.guidance.lora import add_lora
+from fd_mitsuba.guidance.lora import add_lora, lora_files
 from fd_mitsuba.guidance.memory import BYTES, critic_bytes, require_memory, working_set_bytes
-from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions, read_model_conventions
+from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
+from fd_mitsuba.guidance.model_headers import read_headers
 from fd_mitsuba.guidance.multiview import join_views
-from fd_mitsuba.guidance.multiview_layout import ORIGINAL_CLASS, converted_unet, multiview_conventions, unet_config
+from fd_mitsuba.guidance.multiview_layout import converted_unet
 from fd_mitsuba.guidance.network_passes import rows_at_once
 from fd_mitsuba.guidance.variants import critic_rank
 from fd_mitsuba.io.hub import hub_snapshot, is_offline, local_folder
@@ -75,21 +71,8 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
         UserError: one line that names the file and what to do, for a folder or hub id that does not exist, a layout
             other than Stable Diffusion's, a missing or damaged file, weights that do not fit the config, no memory.
     """
-    folder = locate(config.model, appearance)
-    index = read_layout(folder)
-    configs = {part: read_json(folder / part / "config.json") for part in WEIGHTS}
-    original = configs["unet"].get("_class_name") == ORIGINAL_CLASS
-    configs["unet"] = unet_config(folder / "unet" / "config.json", configs["unet"])
-    conventions = multiview_conventions(folder, configs["unet"], read_model_conventions(folder), config)
-    check_sizes(folder, configs, conventions)
-    files = {part: weight_files(folder, part) for part in WEIGHTS}
-    counts = {part: sum(map(count_weights, files[part][0])) for part in WEIGHTS}
-    with_picture = asks_for_image_prompt(config)
-    if (config.lora or config.words or config.controlnet or with_picture) and is_builtin(config.model):
-        raise UserError(
-            "guidance.lora, words, image_prompt and controlnet are made for Stable Diffusion; set guidance.model to "
-            "such a model"
-        )
+    headers = read_headers(locate(config.model, appearance), config)
+    folder, configs, counts, conventions = headers.folder, headers.configs, headers.counts, headers.conventions
     control, control_weights, control_variant = None, 0, None
     if config.controlnet:
         control = locate_controlnet(config.controlnet)
@@ -107,9 +90,8 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
         device,
         str(folder),
     )
-    variants = {part: variant for part, (_, variant) in files.items()}
-    unet = _converted(files["unet"][0], configs["unet"], config) if original else None
-    loaded = _with_additions(_load(folder, index, variants, config, conventions, device, unet), config)
+    unet = _converted(headers.files["unet"], configs["unet"], config) if headers.is_original else None
+    loaded = _with_additions(_load(folder, headers.index, headers.variants, config, conventions, device, unet), config)
     if conventions.views_together is not None:
         join_views(loaded.unet, conventions.views_together)
     if control is None:
@@ -119,8 +101,8 @@ def load_components(config: GuidanceConfig, device: str = "cpu", appearance: boo
 
 def _with_additions(loaded: Components, config: GuidanceConfig) -> Components:
     """The components after LoRA files and learned words were added to them."""
-    for path in config.lora:
-        add_lora(Path(path).expanduser(), config.lora_scale, loaded.unet, loaded.text_encoder)
+    for file in lora_files(config.lora):
+        add_lora(file, config.lora_scale, loaded.unet, loaded.text_encoder)
     words = [add_word(Path(path).expanduser(), loaded.tokenizer, loaded.text_encoder) for path in config.words]
     picture = None
     if asks_for_image_prompt(config):
@@ -140,7 +122,7 @@ def locate(model: str, appearance: bool = False, setting: str = "guidance.model"
     """
     if (shipped := shipped_folder(model, appearance)) is not None:
         return builtin_folder(shipped)
-    folder = local_folder(model, setting, "Stable-Diffusion layout")
+    folder = local_folder(model, setting, LAYOUT_NAME)
     return _snapshot(model) if folder is None else folder
 
 
@@ -199,6 +181,7 @@ def _load(
         generic = index["tokenizer"][1] == "PreTrainedTokenizerFast"
         owner = transformers.PreTrainedTokenizerFast if generic else transformers.CLIPTokenizer
         tokenizer = owner.from_pretrained(str(folder / "tokenizer"), local_files_only=True)
+        tokenizer("a")  # one without words is only told as it reads
     known = loaded["text_encoder"].config.vocab_size
     if len(tokenizer) > known:
         raise UserError(
@@ -208,6 +191,8 @@ def _load(
         scheduler = scheduler_class.from_pretrained(str(folder / "scheduler"), local_files_only=True)
     if not hasattr(scheduler, "alphas_cumprod"):
         raise UserError(f"{folder / 'scheduler'}: {index['scheduler'][1]} has no noise levels alphas_cumprod; {LAYOUT}")
+    if not torch.isfinite(scheduler.alphas_cumprod).all():
+        raise UserError(f"{folder / 'scheduler'}: its noise levels are not finite; fetch the model again")
     return Components(tokenizer, loaded["text_encoder"], loaded["unet"], loaded["vae"], scheduler, conventions, folder)
 
 

@@ -10,7 +10,9 @@ Names are read as Diffusers and PEFT write them (`unet.….to_q.lora_A.weight`),
 from __future__ import annotations
 
 import json
+import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,6 +88,25 @@ def lora_file(path: Path, setting: str = "guidance.lora") -> Path:
     return path
 
 
+def lora_files(paths: Iterable[str]) -> list[Path]:
+    """The files of `guidance.lora`; UserError where one is missing, or named twice, which would add it twice."""
+    files: dict[Path, Path] = {}
+    for path in paths:
+        file = lora_file(Path(path).expanduser())
+        if file.resolve() in files:
+            raise UserError(
+                f"{file}: is named twice in guidance.lora; remove one, and use guidance.lora_scale for more"
+            )
+        files[file.resolve()] = file
+    return list(files.values())
+
+
+def refuse_non_finite(file: Path, key: str, value: Tensor) -> None:
+    """UserError where a tensor of a file has a NaN or an infinite value, which would spread to all that is guided."""
+    if not torch.isfinite(value.float()).all():  # there is no `isfinite` of 8 bits
+        raise UserError(f"{file}: {key} has values that are not finite; fetch the file again, or take another")
+
+
 _OTHER_MODEL = "it was made for another one; take a LoRA for the model that guidance.model names"
 
 
@@ -117,12 +138,18 @@ def _adapter_settings(file: Path, metadata: dict[str, str]) -> dict[str, float]:
     """Component -> alpha for all of its layers, where PEFT wrote it down."""
     try:
         known = json.loads(metadata.get("lora_adapter_metadata", "{}"))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise UserError(f"{file}: its lora_adapter_metadata is not JSON; fetch the file again") from None
+    if not isinstance(known, dict):
+        raise UserError(f"{file}: its lora_adapter_metadata is no JSON object; fetch the file again")
     for key, value in known.items():
         if key.rpartition(".")[2] in _UNREAD and value:
             raise UserError(f"{file}: its {key} = {value!r} is not read here; take a plain LoRA")
-    return {name: float(known[f"{name}.lora_alpha"]) for name in _COMPONENTS if f"{name}.lora_alpha" in known}
+    alphas = {name: known[f"{name}.lora_alpha"] for name in _COMPONENTS if f"{name}.lora_alpha" in known}
+    for name, alpha in alphas.items():
+        if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
+            raise UserError(f"{file}: its {name}.lora_alpha is {alpha!r}, not a finite number; fetch the file again")
+    return {name: float(alpha) for name, alpha in alphas.items()}
 
 
 def _take(found: _Changes, key: str, value: Tensor) -> None:
@@ -136,8 +163,11 @@ def _take(found: _Changes, key: str, value: Tensor) -> None:
     component = next(name for name, prefixes in _COMPONENTS.items() if prefix in prefixes)
     place = place.removeprefix(prefix).replace(".processor.", ".").removesuffix("_lora")
     place = re.sub(r"\.to_out$", ".to_out.0", place).replace(".", "_")
+    refuse_non_finite(found.path, key, value)
     change = found.layers[component].setdefault(place, _Change())
     if match is None:
+        if value.numel() != 1:
+            raise UserError(f"{found.path}: {key} has {value.numel()} values, not one; fetch the file again")
         change.alpha = float(value)
     elif match["side"] in ("A", "down"):
         change.down = value.float()
@@ -149,9 +179,11 @@ def _delta(file: Path, place: str, change: _Change, weight: Tensor) -> Tensor:
     """(alpha / rank) up down in the shape of the layer's weight."""
     if change.down is None or change.up is None:
         raise UserError(f"{file}: {place} lacks one of its two matrices; fetch the file again")
+    shapes = f"{tuple(change.down.shape)} and {tuple(change.up.shape)}"
+    if min(change.down.ndim, change.up.ndim) < 2 or not len(change.down):
+        raise UserError(f"{file}: {place}: {shapes} are no two matrices of a rank above 0; fetch the file again")
     rank, fits = len(change.down), change.up.shape[1] == len(change.down)
     product = change.up.flatten(1) @ change.down.flatten(1) if fits and change.up.flatten(1).shape[1] == rank else None
     if product is None or len(product) != len(weight) or product.numel() != weight.numel():
-        shapes = f"{tuple(change.down.shape)} and {tuple(change.up.shape)}"
         raise UserError(f"{file}: {place}: matrices {shapes} for a weight {tuple(weight.shape)}; {_OTHER_MODEL}")
     return (change.alpha if change.alpha is not None else rank) / rank * product.view(weight.shape)

@@ -16,5 +16,5 @@ def vocabulary_of(model: str, appearance: bool = False) -> Vocabulary | None:
         model: `builtin`, `builtin-fine`, a folder, or a hub id, of which nothing is known.
         appearance: of a built-in one, the prior of the appearance stage.
     """
-    folder = shipped_folder(model, appearance) or Path(model)
+    folder = shipped_folder(model, appearance) or Path(model).expanduser()
     return read_model_conventions(folder).vocabulary if folder.is_dir() else None

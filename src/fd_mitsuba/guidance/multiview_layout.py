@@ -13,6 +13,7 @@ import torch
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.layout import check_square
 from fd_mitsuba.guidance.model_conventions import FILE_NAME, ModelConventions
 from fd_mitsuba.guidance.multiview import CAMERA_NUMBERS, TEMPLATE, USUAL_GROUP, is_multiview
 
@@ -57,6 +58,7 @@ def unet_config(path: Path, config: dict[str, Any]) -> dict[str, Any]:
     for key, value in _PLAIN.items():
         if config.get(key, value) != value:
             raise UserError(f"{path}: {key} = {config[key]!r} has no place in Diffusers' UNet; take MVDream's layout")
+    check_square(path, config, "image_size")
     try:
         return _in_diffusers_terms(config)
     except (TypeError, ValueError, KeyError, ZeroDivisionError):
@@ -65,6 +67,8 @@ def unet_config(path: Path, config: dict[str, Any]) -> dict[str, Any]:
 
 def _in_diffusers_terms(config: dict[str, Any]) -> dict[str, Any]:
     widths = [int(config["model_channels"]) * int(factor) for factor in config["channel_mult"]]
+    if min(widths) < 1:
+        raise ValueError("model_channels")
     attends = [2**level in config["attention_resolutions"] for level in range(len(widths))]
     per_head, heads = config.get("num_head_channels", -1), config.get("num_heads", -1)
     if per_head == heads == -1:

@@ -32,7 +32,7 @@ class PictureLatents:
         self.vae_scale_factor = 2 ** (
             len(settings.get("encoder_block_out_channels") or settings.block_out_channels) - 1
         )
-        self.scaling_factor = float(settings.get("scaling_factor") or 1.0)
+        self.scaling_factor = float(settings.get("scaling_factor", 1.0))
         self.shift_factor = float(settings.get("shift_factor") or 0.0)
         auto = "signed" if conventions.is_packed else "unit"
         self.signed_mask = (auto if config.mask_channel == "auto" else config.mask_channel) == "signed"

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fd_mitsuba.config import GuidanceConfig, Section
 from fd_mitsuba.config.registry import Registry
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.query import Pass, Query, Variant
 
@@ -165,6 +166,20 @@ class VariationalScore(Variant):
         noise_hat = query.guided(z_t, timesteps)
         preview = sds.clean_estimate(z_t, noise_hat, query.alpha_bar(timesteps))
         return sds.sds_gradient(noise_hat, query.criticised(z_t, timesteps), query.weights()), preview
+
+
+def refuse_conflicts(config: GuidanceConfig) -> None:
+    """UserError where settings do not go with the variant."""
+    variant = VARIANTS.make(config.variant, "guidance.variant")
+    if config.perp_neg and "guided" not in variant.passes:
+        raise UserError(
+            f"guidance.perp_neg = {config.perp_neg:g}: {config.variant.kind} makes no use of it; set it to 0"
+        )
+    if variant.learns and config.dtype == "float16":
+        raise UserError(
+            f"guidance.variant = {config.variant.kind}: what its critic learns is too small for float16; set "
+            "guidance.dtype to bfloat16 or float32"
+        )
 
 
 def critic_rank(config: GuidanceConfig) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fd_mitsuba.config import RunConfig, misfits
+from fd_mitsuba.config.for_model import is_builtin
 from fd_mitsuba.conventions import GRID_HALF_EXTENT
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
@@ -14,6 +15,7 @@ from fd_mitsuba.io.float_steps import size_warnings
 from fd_mitsuba.runs.check_report import BaseCheck, CheckReport, RegionCheck
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import estimate_cost
+from fd_mitsuba.runs.model_check import check_model
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs, check_shading
 from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -77,13 +79,19 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
 
 
 def _prompts(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None, dict[str, PromptReading], str | None]:
-    """How the guidance models read the scene's prompt and those of parts, and why they would refuse them."""
+    """How the guidance models read the scene's prompt and those of parts, and why a run would refuse models or them."""
     by_words = config.appearance.lambda_sds > 0 and scene.has_light and not scene.subtracts
     asked = {False: config.geometry.lambda_sds > 0, True: by_words}
-    reading, parts = None, {}
+    reading, parts, refused, model = None, {}, None, config.guidance.model
+    try:
+        # The built-in prior knows no cuts, so that their material is left as it is; other models paint them, too.
+        paints = by_words or (config.appearance.lambda_sds > 0 and scene.has_light and not is_builtin(model))
+        check_model(config, asked[False], paints)
+    except UserError as error:  # a run loads its model before it reads the prompt
+        refused = str(error)
     try:
         for appearance in (stage for stage, wanted in asked.items() if wanted):
-            if (vocabulary := vocabulary_of(config.guidance.model, appearance)) is None:
+            if (vocabulary := vocabulary_of(model, appearance)) is None:
                 continue
             found = understood_prompt(scene.prompt, vocabulary, scene.base_prompt, scene.subtracts)
             reading = reading or found
@@ -91,8 +99,8 @@ def _prompts(scene: EditScene, config: RunConfig) -> tuple[PromptReading | None,
                 words = own.prompt, vocabulary, scene.base_prompt, scene.subtracts
                 parts.setdefault(part, understood_part_prompt(part, *words))
     except UserError as error:
-        return reading, parts, str(error)
-    return reading, parts, None
+        return reading, parts, refused or str(error)
+    return reading, parts, refused
 
 
 def _user_corner(scene: EditScene, value: float) -> tuple[float, ...]:

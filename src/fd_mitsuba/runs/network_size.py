@@ -40,7 +40,7 @@ def network_size(model: str, appearance: bool = False) -> NetworkSize:
         appearance: `builtin` means the prior of colours.
     """
     shipped = shipped_folder(model, appearance)
-    folder = Path(model) if shipped is None else shipped
+    folder = Path(model).expanduser() if shipped is None else shipped
     usual = NetworkSize()
     try:
         config = read_json(folder / "unet" / "config.json")
