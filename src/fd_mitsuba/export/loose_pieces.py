@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from fd_mitsuba.export.solid.solid import Solid
 from fd_mitsuba.scene.mesh_distance import MeshDistance
@@ -38,13 +36,8 @@ class LoosePieces:
 
 def bodies(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The connected surface, counted from 0, that each face (F,) belongs to; equal positions are one vertex."""
-    _, weld = np.unique(np.asarray(vertices) + 0.0, axis=0, return_inverse=True)
-    ends = weld.reshape(-1)[faces]
-    pairs = np.concatenate([ends[:, [0, 1]], ends[:, [1, 2]]])
-    count = len(vertices)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    label = connected_components(graph, directed=False)[1][ends[:, 0]]
-    return np.unique(label, return_inverse=True)[1].reshape(-1)
+    rows, weld = np.unique(np.asarray(vertices) + 0.0, axis=0, return_inverse=True)
+    return Solid(rows, weld.reshape(-1)[faces]).pieces()
 
 
 def loose_pieces(
