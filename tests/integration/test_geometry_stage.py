@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -160,6 +161,15 @@ def test_the_tether_loss_hangs_a_loose_piece_on_the_base(stage: Callable[..., Ge
         return label_pieces(solid.numpy())[1]
 
     assert (pieces(0.0), pieces(100.0)) == (2, 1)
+
+
+@pytest.mark.parametrize("subtracts, words", [(False, "lower geometry.lambda_volume"), (True, "what is to go")])
+def test_what_to_do_about_a_part_that_nobody_sees(subtracts: bool, words: str) -> None:
+    stage = SimpleNamespace(
+        counters={"invisible_steps": VANISHED_AFTER - 1}, scene=SimpleNamespace(subtracts=subtracts)
+    )
+    with pytest.raises(RunStopped, match=words):
+        GeometryStage._watch_visibility(stage, torch.zeros(1, 5, 2, 2))  # type: ignore[arg-type]
 
 
 def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., GeometryStage], tmp_path: Path) -> None:

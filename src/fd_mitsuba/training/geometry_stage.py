@@ -287,6 +287,9 @@ class GeometryStage:
         self.counters["invisible_steps"] = 0 if visible else self.counters["invisible_steps"] + 1
         if self.counters["invisible_steps"] >= VANISHED_AFTER:
             raise RunStopped(
-                f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
+                f"no cut has been visible for {VANISHED_AFTER} steps, so there seems to be nothing to take off; move "
+                "the focal region onto all of what is to go"
+                if self.scene.subtracts
+                else f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
                 "or lower geometry.lambda_volume"
             )
