@@ -53,7 +53,9 @@ def test_words_find_the_place(beast: ObjectPlaces, words: str, point: tuple, nor
     assert np.allclose(place.point, point, atol=0.1) and np.allclose(place.normal, normal, atol=0.1)
     # It is a point of the surface: one of the three ellipsoids, whose faces lie a little within.
     region = beast.region(place, 0.4)
-    assert np.allclose(region.centre - place.point, 0.7 * 0.2 * place.normal)
+    assert np.allclose(region.centre - place.point, 0.7 * 0.2 * place.normal) and not region.subtracts
+    cut = beast.region(place, 0.4, subtracts=True)
+    assert np.allclose(cut.centre - place.point, -0.7 * 0.2 * place.normal) and cut.subtracts
 
 
 def test_front_and_rear_are_the_ends(beast: ObjectPlaces) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -32,10 +31,9 @@ def placed_regions(
     found = [places.find(word) for word in at]
     count = Counter(place.name for place in found)
     regions = [
-        places.region(place, extent, f"{place.name}_{number}" if count[place.name] > 1 else place.name)
+        places.region(place, extent, f"{place.name}_{number}" if count[place.name] > 1 else place.name, subtract)
         for number, place in enumerate(found, 1)
     ]
-    regions = [replace(region, subtracts=subtract) for region in regions]
     shown = " x ".join(f"{value:.3g}" for value in extent) + (", subtracts" if subtract else "")
     return regions, [f"{region.name}: {place.about}, {shown}" for place, region in zip(found, regions, strict=True)]
 

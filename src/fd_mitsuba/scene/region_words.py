@@ -15,7 +15,7 @@ from fd_mitsuba.scene.picture_rays import pixel_ray
 DEFAULT_SIZE = 0.3
 """Of a region, as a share of the object's longest side."""
 _REACH = 0.3
-"""Share of a region's half axis by which it reaches into the object."""
+"""Share of a region's half axis by which it reaches into the object, or out of it where it subtracts."""
 _SAMPLES = 20_000
 _UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
 _DIRECTIONS = {
@@ -119,16 +119,19 @@ class ObjectPlaces:
             return self._side(_DIRECTIONS[words], words.replace(" ", "_"), self._points, f"its {words}")
         raise UserError(f"--at {text}: is not known; say {', '.join(WORDS)}, 'front of the head', or x,y,z")
 
-    def region(self, place: Place, size: float | tuple[float, ...], name: str | None = None) -> PlacedRegion:
-        """The ellipsoid at a place, which reaches a little into the object.
+    def region(
+        self, place: Place, size: float | tuple[float, ...], name: str | None = None, subtracts: bool = False
+    ) -> PlacedRegion:
+        """The ellipsoid at a place: it reaches a little into the object, or with `subtracts` stands out of it a little.
 
         Args:
             size: its width, or width, height and depth, in the object's unit: height is along the place's normal.
         """
         extent = np.broadcast_to(np.asarray(size, dtype=np.float64), (3,))
         half = extent / 2
-        centre = place.point + (1 - _REACH) * half[1] * place.normal
-        return PlacedRegion(name or place.name, centre, half, _upright(place.normal))
+        outwards = (_REACH - 1 if subtracts else 1 - _REACH) * half[1]
+        centre = place.point + outwards * place.normal
+        return PlacedRegion(name or place.name, centre, half, _upright(place.normal), subtracts)
 
     @cached_property
     def _corners(self) -> np.ndarray:
