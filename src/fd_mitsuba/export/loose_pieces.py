@@ -54,38 +54,28 @@ def loose_pieces(
     piece, crumb, solids, large = bodies(vertices, faces), np.zeros(len(faces), dtype=bool), [], 0
     corners = vertices[faces] - vertices.mean(axis=0)
     volume = np.bincount(piece, np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
-    cut = np.bincount(piece, body < 0) > 0
+    cut, candidates = np.bincount(piece, body < 0) > 0, []
     for own in np.unique(body[(body >= 0) & cut[piece]]):
         parts = np.unique(piece[body == own])
-        parts = parts[volume[parts] > 0]
-        for part in sorted(parts, key=lambda part: -volume[part])[1:]:
-            mine = piece == part
-            if _is_held(vertices, faces[mine], [(vertices, faces[~mine]), *others]):
-                continue
-            if volume[part] > CRUMB_SHARE * removed:
-                large += 1
-                continue
-            solid = Solid(*_used(vertices, faces[mine]))
-            hollow = [part, *(p for p in np.flatnonzero(volume < 0) if _is_within(solid, vertices[faces[piece == p]]))]
-            crumb |= np.isin(piece, hollow)
-            solids.append(solid)
-    return LoosePieces(crumb, tuple(solids), large)
-
-
-def _is_held(vertices: np.ndarray, faces: np.ndarray, others: Sequence[Mesh]) -> bool:
-    points = vertices[np.unique(faces)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    for far, triangles in others:
-        corners = far[triangles]
-        near = np.all((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low), axis=1).any()
-        size = float(np.ptp(far, axis=0).max())
-        inside = np.all((points.mean(axis=0) > far.min(axis=0)) & (points.mean(axis=0) < far.max(axis=0)))
-        if not (near or inside):
+        candidates += sorted(parts[volume[parts] > 0], key=lambda part: -volume[part])[1:]
+    if not candidates:
+        return LoosePieces(crumb, (), 0)
+    # What hangs free itself holds nothing. Each search tree is built once, however many pieces there are.
+    holds = [MeshDistance(*mesh) for mesh in ((vertices, faces[~np.isin(piece, candidates)]), *others)]
+    touch = _TOUCH * float(np.ptp(vertices, axis=0).max())
+    for part in candidates:
+        mine = faces[piece == part]
+        points = vertices[np.unique(mine)]
+        if any(hold.unsigned(points).min() <= touch or hold.inside(points).any() for hold in holds):
             continue
-        distance = MeshDistance(far, triangles)
-        if distance.unsigned(points).min() <= _TOUCH * size or distance.inside(points).any():
-            return True
-    return False
+        if volume[part] > CRUMB_SHARE * removed:
+            large += 1
+            continue
+        solid = Solid(*_used(vertices, mine))
+        hollow = [part, *(p for p in np.flatnonzero(volume < 0) if _is_within(solid, vertices[faces[piece == p]]))]
+        crumb |= np.isin(piece, hollow)
+        solids.append(solid)
+    return LoosePieces(crumb, tuple(solids), large)
 
 
 def _is_within(solid: Solid, corners: np.ndarray) -> bool:
