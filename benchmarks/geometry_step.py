@@ -80,15 +80,15 @@ def plain_step(stage: GeometryStage, step: int) -> None:
     """The same step by the shortest code that can be written."""
     geometry = stage.config.geometry
     cameras, _ = stage.cameras(step)
-    samples = stage.field_losses.draw(step)
-    surface = stage.extractor.extract_plain(stage.field, samples)
+    asked = stage.field_losses.ask(step)
+    surface = stage.extractor.extract_plain(stage.field, asked.drawn)
     pictures = render_plain(
         surface.vertices, surface.faces, surface.part_weight, cameras, step,
         PICTURE_SIZE, geometry.spp, geometry.silhouette_spp,
     )  # fmt: skip
     views = GuidanceViews(pictures, None, cameras.azimuth_deg, cameras.elevation_deg)
     losses = {"sds": stage.guidance.guide(views, step, 1, "coarse", 0).loss}
-    losses.update(stage.field_losses(surface.sample_sdf, samples))
+    losses.update(stage.field_losses(surface.sample_sdf, asked))
     total = sum(getattr(geometry, f"lambda_{name}") * loss for name, loss in losses.items())
     stage.optimiser.zero_grad(set_to_none=True)
     total.backward()

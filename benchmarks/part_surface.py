@@ -162,7 +162,7 @@ def main() -> None:
     for folder in options.runs:
         for row in measure(folder):
             if options.json:
-                print(json.dumps(row), flush=True)
+                print(json.dumps(row, default=float), flush=True)
                 continue
             print(
                 f"{row['run']:12} faces {row['faces']:6} manifold {row['manifold']}  angle_p5 {row['angle_p5']:.1f} "

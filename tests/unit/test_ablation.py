@@ -34,7 +34,8 @@ def test_rows_change_what_they_say() -> None:
     assert jobs["no_focal-0"].settings().geometry.lambda_focal == 0 and jobs["no_focal-0"].stage == "geometry"
     assert jobs["no_collision-0"].settings().geometry.lambda_collision == 0
     alone = jobs["paper_no_collision-0"].settings().geometry
-    assert alone.lambda_collision == alone.lambda_volume == alone.lambda_presence == alone.lambda_tether == 0
+    assert alone.lambda_collision == alone.lambda_volume == alone.lambda_presence == 0
+    assert alone.lambda_tether == alone.lambda_curvature == 0
     assert alone.lambda_focal > 0
     assert jobs["paper-0"].settings().geometry.lambda_collision > 0 == jobs["paper-0"].settings().geometry.lambda_volume
     assert not jobs["no_style-0"].settings().appearance.style

@@ -8,7 +8,7 @@ import torch
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
-from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.descent import adamw, descend, fade
 
 RATE, BETAS, EPS, DECAY = 0.1, (0.6, 0.8), 0.05, 0.2
 
@@ -45,3 +45,24 @@ def test_a_loss_that_is_no_number_ends_the_run_and_changes_nothing() -> None:
     with pytest.raises(RunStopped, match="step 7: .*lower it"):
         descend(optimiser, {"sds": field.weight.sum() * torch.nan}, {"sds": 1.0}, 7, "lower it")
     assert torch.equal(field.weight, before)
+
+
+@pytest.mark.parametrize("stage", ["geometry", "appearance"])
+def test_steps_become_small_at_the_end_and_follow_from_their_number(stage: str) -> None:
+    """A constant slope: what Adam then moves by is the step size itself."""
+    settings = {"learning_rate": RATE, "weight_decay": 0.0, "steps": 8, "fade": 0.5}
+    config = getattr(RunConfig.model_validate({stage: settings}), stage)
+    field = torch.nn.Linear(1, 1, bias=False)
+    optimiser = adamw(field, config)
+    moved = []
+    for step in range(8):
+        before = float(field.weight.detach())
+        fade(optimiser, config, step)
+        descend(optimiser, {"one": field.weight.sum()}, {"one": 1.0}, step, "wait")
+        moved.append((before - float(field.weight.detach())) / RATE)
+    half = np.sqrt(0.5) / 2
+    np.testing.assert_allclose(moved, [1, 1, 1, 1, 1, 0.5 + half, 0.5, 0.5 - half], rtol=1e-4)
+    fade(optimiser, config, 2)
+    assert optimiser.param_groups[0]["lr"] == RATE
+    fade(optimiser, config.model_copy(update={"fade": 0.0}), 7)
+    assert optimiser.param_groups[0]["lr"] == RATE

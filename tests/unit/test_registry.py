@@ -28,6 +28,7 @@ from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.sources import load_guidance
 from fd_mitsuba.guidance.variants import VARIANTS
+from fd_mitsuba.losses.curvature import STENCIL
 from fd_mitsuba.runs.choices import REGISTRIES, checked_choices, described
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.region_shapes import REGION_SHAPES, shape_arrays
@@ -73,9 +74,9 @@ def a_critic_that_has_learned_nothing_is_the_model(name: str) -> None:
     assert preview.shape == what.z.shape
 
 
-@shows("geometry_losses", "focal", "collision", "volume", "presence", "tether")
+@shows("geometry_losses", "focal", "collision", "volume", "presence", "tether", "curvature")
 def a_loss_moves_the_field_where_it_should(name: str) -> None:
-    """Four points: in the region, far outside, inside the base, and where a loose piece should hang on."""
+    """In the region, far outside, inside the base, where a loose piece should hang on, and on top of a surface."""
     place = FieldPlace(
         positions=torch.zeros(3, 3),
         sdf_base=torch.tensor([-0.5, -0.5, 0.2]),
@@ -85,8 +86,11 @@ def a_loss_moves_the_field_where_it_should(name: str) -> None:
         subtracts=False,
         run_seed=0,
     )
-    sdf = torch.tensor([-0.02, 0.02, 0.02, -0.1], requires_grad=True)
-    loss = GEOMETRY_LOSSES.make(Choice.of(name), "here")(FieldSamples(sdf[:3], torch.arange(3), sdf[3:], place, 0))
+    sdf = torch.tensor([-0.02, 0.02, 0.02, -0.1, 0.01], requires_grad=True)
+    around = torch.tensor([-0.1 * z for _, _, z in STENCIL])  # a plane but for its middle
+    dent = torch.where((torch.tensor(STENCIL) == 0).all(dim=1), sdf[4], around)[None]
+    at = FieldSamples(sdf[:3], torch.arange(3), sdf[3:4], place, 0, dent)
+    loss = GEOMETRY_LOSSES.make(Choice.of(name), "here")(at)
     loss.backward()
     grows, shrinks = {
         "focal": ([], [1]),
@@ -94,8 +98,9 @@ def a_loss_moves_the_field_where_it_should(name: str) -> None:
         "volume": ([], [0, 1, 2]),
         "presence": ([0], []),
         "tether": ([3], []),
+        "curvature": ([], [4]),
     }[name]
-    sign = torch.zeros(4)
+    sign = torch.zeros(5)
     sign[grows], sign[shrinks] = -1, 1
     assert loss.dim() == 0 and torch.equal(sdf.grad.sign(), sign)
 
@@ -190,7 +195,7 @@ def test_built_in_losses_have_the_defaults_of_their_flat_settings() -> None:
 def test_weights_of_built_in_losses_are_the_flat_ones() -> None:
     config = RunConfig.load("quick")
     weights = {name: weight for name, (weight, _) in geometry_losses.built_in_losses(config.geometry).items()}
-    assert weights == {"focal": 1e5, "collision": 1e5, "volume": 0.5, "presence": 20, "tether": 20}
+    assert weights == {"focal": 1e5, "collision": 1e5, "volume": 0.5, "presence": 20, "tether": 20, "curvature": 0}
     style = config.appearance.model_copy(update={"style": True})
     weights = {name: weight for name, (weight, _) in appearance_losses.built_in_losses(style).items()}
     assert weights == {"style_gradient": 1000, "style_boundary": 1e5, "bend": 5000}
@@ -392,24 +397,24 @@ def test_a_loss_without_weight_is_not_even_made(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(GEOMETRY_LOSSES, "_entries", dict(GEOMETRY_LOSSES._entries))
     GEOMETRY_LOSSES.register("doubtful", Depth)(Doubtful)
     idle = field_losses("geometry.losses.doubtful.lambda=0")
-    assert idle.draw(0) is None and idle.weights == {} and Doubtful.made == 0
+    assert idle.ask(0) is None and idle.weights == {} and Doubtful.made == 0
     busy = field_losses("geometry.losses.doubtful.lambda=2", "geometry.lambda_volume=3")
-    samples = busy.draw(0)
-    assert samples is not None and busy.weights == {"volume": 3, "doubtful": 2} and Doubtful.made == 1
-    assert list(busy(torch.ones(len(samples)), samples, 0)) == ["volume", "doubtful"]
+    asked = busy.ask(0)
+    assert asked is not None and busy.weights == {"volume": 3, "doubtful": 2} and Doubtful.made == 1
+    assert list(busy(torch.ones(len(asked.drawn)), asked, 0)) == ["volume", "doubtful"]
     monkeypatch.setattr(Doubtful, "in_cuts", False)
     cut = ("geometry.losses.doubtful.lambda=2", "geometry.lambda_volume=3")
-    assert field_losses(*cut, subtracts=True).draw(0) is None
+    assert field_losses(*cut, subtracts=True).ask(0) is None
 
 
 def test_a_loss_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GEOMETRY_LOSSES, "_entries", dict(GEOMETRY_LOSSES._entries))
     GEOMETRY_LOSSES.register("doubtful", Depth)(Doubtful)
     wrong = field_losses("geometry.losses.doubtful={lambda=1, depth=2}")
-    samples = wrong.draw(0)
-    assert samples is not None
+    asked = wrong.ask(0)
+    assert asked is not None
     with pytest.raises(UserError, match=r"geometry.losses.doubtful: gives a tensor of shape \(\d+,\), not a scalar"):
-        wrong(torch.ones(len(samples)), samples, 0)
+        wrong(torch.ones(len(asked.drawn)), asked, 0)
 
 
 def test_what_a_loss_may_use_is_that_of_its_samples() -> None:

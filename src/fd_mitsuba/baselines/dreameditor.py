@@ -35,7 +35,7 @@ from fd_mitsuba.fields.mlp import ColumnMlp
 from fd_mitsuba.guidance.interface import Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.views import CameraBatch
-from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.descent import adamw, descend, fade
 from fd_mitsuba.training.geometry_stage import EXPLODED_BEYOND, GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.seeds import Purpose, seed_for
@@ -146,6 +146,7 @@ class VertexEditStage(GuidedStage):
         losses = {"sds": result.loss, "smooth": mesh.loss_smooth(vertices)}
         weights = {"sds": self.config.geometry.lambda_sds, "smooth": self._lambda}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
+        fade(self.optimiser, self.config.geometry, step)
         values = result.logs | descend(self.optimiser, losses, weights, step, remedy)
         return StepRecord(values, partial(geometry_sheet, pictures.detach(), result.preview))
 

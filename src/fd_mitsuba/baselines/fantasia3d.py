@@ -26,7 +26,7 @@ from fd_mitsuba.fields.part_sdf import PartField
 from fd_mitsuba.guidance.interface import Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.mesh_distance import MeshDistance
-from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.descent import adamw, descend, fade
 from fd_mitsuba.training.geometry_stage import EXPLODED_BEYOND, GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.seeds import Purpose, seed_for
@@ -85,6 +85,7 @@ class WholeObjectStage(GuidedStage):
             inside = (0.5 + surface.sample_sdf / (2 * self.own.grid.spacing)).clamp(0, 1)
             losses["volume"], weights["volume"] = inside.mean(), self._settings.lambda_volume
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
+        fade(self.optimiser, self.config.geometry, step)
         values = result.logs | descend(self.optimiser, losses, weights, step, remedy)
         values["faces"] = float(len(surface.faces))
         return StepRecord(values, partial(geometry_sheet, pictures.detach(), result.preview))

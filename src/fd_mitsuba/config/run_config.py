@@ -31,6 +31,8 @@ _CHOICES = ("kind", "variant")
 _NEWER = {
     "geometry.lambda_tether": 0.0,
     "geometry.start_variety": 0.0,
+    "geometry.lambda_curvature": 0.0,
+    "geometry.fade": 0.0,
     "guidance.perp_neg": 0.0,
     "guidance.mask_margin": 2,
     "guidance.lora": [],
@@ -48,6 +50,7 @@ _NEWER = {
     "guidance.refined_background": "black",
     "guidance.reduction": "mean",
     "appearance.soft_mask": False,
+    "appearance.fade": 0.0,
 }
 """Settings that came after the first runs, at the value that does nothing: so those runs can still be read."""
 

@@ -60,6 +60,8 @@ class OptimisedSection(Section):
     """Decay rates of AdamW's running averages."""
     eps: Rate = 1e-15
     """Smallest divisor in a step of AdamW."""
+    fade: Fraction = 0.0
+    """Share of the steps, the last ones, over which the step size falls to zero; not in the paper."""
     weight_decay: Fraction = 0.01
     """Weight decay of AdamW."""
 
@@ -108,6 +110,8 @@ class GeometryConfig(OptimisedSection):
     """Share of each region, outside the base, that it keeps filled."""
     lambda_tether: Weight = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
+    lambda_curvature: Weight = 0.0
+    """Weight of the price of curvature of the part's surface, edges apart; not in the paper."""
     losses: dict[str, Weighted] = {}
     """Losses of other modules by name, each with its `lambda` and its own settings; see docs/extending.md."""
     views: Views = 4

@@ -54,7 +54,7 @@ def _colour_scale(value: float, name: str) -> Row:
     return Row(name, title, (f"appearance.guidance_scale={value:g}",), "appearance")
 
 
-_PAPER_LOSSES = ("geometry.lambda_volume=0", "geometry.lambda_presence=0", "geometry.lambda_tether=0")
+_PAPER_LOSSES = tuple(f"geometry.lambda_{name}=0" for name in ("volume", "presence", "tether", "curvature"))
 """Without our own additions: a price on volume also takes away what hides in the base, where no picture holds it, and
 pulls in what leaves the region, so what L_GF and L_CA do by themselves shows only without it."""
 

@@ -34,7 +34,7 @@ from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
-from fd_mitsuba.training.descent import adamw, descend
+from fd_mitsuba.training.descent import adamw, descend, fade
 from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.single_path import learn_base_material
@@ -166,6 +166,7 @@ class AppearanceStage:
         values = processes().values_of_all(values)
         losses.update(self.losses(texture, gbuffer, self.field, step))
         weights = {"sds": settings.lambda_sds, **self.losses.weights}
+        fade(self.optimiser, settings, step)
         values.update(descend(self.optimiser, losses, weights, step, "lower appearance.learning_rate"))
         shown = _detached(pictures), _without_gradient(texture)
         return StepRecord(values, partial(appearance_sheet, gbuffer, *shown, self.exposure, preview))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -23,6 +24,18 @@ def adamw(field: torch.nn.Module, settings: GeometryConfig | AppearanceConfig) -
         weight_decay=settings.weight_decay,
         fused=True,
     )
+
+
+def fade(optimiser: torch.optim.Optimizer, settings: GeometryConfig | AppearanceConfig, step: int) -> None:
+    """Set the step size of step `step`, counted from 0: half a cosine down to zero over the last `settings.fade`.
+
+    What single steps shake, the noise of views, timesteps and latents, leaves the field as the steps become small. It
+    follows from the step alone, so that a resumed run goes on with the same ones.
+    """
+    left = max(1 - step / settings.steps, 0.0)
+    share = 1.0 if left >= settings.fade else 0.5 - 0.5 * math.cos(math.pi * left / settings.fade)
+    for group in optimiser.param_groups:
+        group["lr"] = settings.learning_rate * share
 
 
 def descend(

@@ -1,4 +1,4 @@
-"""The geometry stage's losses on the part's field itself, apart from every picture: L_GF, L_CA and three additions.
+"""The geometry stage's losses on the part's field itself, apart from every picture: L_GF, L_CA and four additions.
 
 An entry of `GEOMETRY_LOSSES` each. The built-in ones have their weights and settings in the section `geometry`, as
 `lambda_focal` and `focal_band`; those of other modules in `geometry.losses`.
@@ -7,9 +7,10 @@ An entry of `GEOMETRY_LOSSES` each. The built-in ones have their weights and set
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from fd_mitsuba.config import GeometryConfig, Section
@@ -18,6 +19,7 @@ from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import Registry
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.losses.collision import loss_collision
+from fd_mitsuba.losses.curvature import STENCIL, loss_curvature
 from fd_mitsuba.losses.focal import loss_focal
 from fd_mitsuba.losses.presence import loss_presence
 from fd_mitsuba.losses.tether import loss_tether
@@ -56,6 +58,8 @@ class FieldSamples:
         at_tethers: (T,) the field where loose pieces should hang on; empty unless `lambda_tether` is set.
         place: the same data for all vertices.
         step: counted from 0 over the stage.
+        at_surface: (K, 19) the field beside the part's surface and around there, in the order of
+            `losses.curvature.STENCIL`; empty unless `lambda_curvature` is set.
     """
 
     sdf_part: Tensor
@@ -63,6 +67,7 @@ class FieldSamples:
     at_tethers: Tensor
     place: FieldPlace
     step: int
+    at_surface: Tensor = field(default_factory=lambda: torch.zeros(0, len(STENCIL)))
 
     @property
     def positions(self) -> Tensor:
@@ -183,9 +188,19 @@ class Tether(FieldLoss):
         return loss_tether(at.at_tethers, at.spacing)
 
 
+@GEOMETRY_LOSSES.register("curvature")
+class Curvature(FieldLoss):
+    """Dents and creases of the part's surface have a price; see `loss_curvature`. A cut should be as the base was."""
+
+    in_cuts = False
+
+    def __call__(self, at: FieldSamples) -> Tensor:
+        return loss_curvature(at.at_surface, at.spacing)
+
+
 def built_in_losses(geometry: GeometryConfig) -> dict[str, tuple[float, Choice]]:
     """Weight and settings of the losses that the section names itself, in the order in which they are added up."""
     focal = {name: getattr(geometry, f"focal_{name}") for name in FocalSettings.model_fields}
     options = {"focal": focal, "presence": {"share": geometry.presence_share}}
-    names = ("focal", "collision", "volume", "presence", "tether")
+    names = ("focal", "collision", "volume", "presence", "tether", "curvature")
     return {name: (getattr(geometry, f"lambda_{name}"), Choice.of(name, options.get(name))) for name in names}

@@ -31,8 +31,8 @@ from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
-from fd_mitsuba.training.descent import adamw, descend
-from fd_mitsuba.training.field_losses import FieldLosses, tether_depth
+from fd_mitsuba.training.descent import adamw, descend, fade
+from fd_mitsuba.training.field_losses import FieldLosses, asked_depth
 from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
@@ -161,8 +161,8 @@ class GeometryStage:
         geometry = self.config.geometry
         phase = self.phase_of(step)[0]
         cameras, closeup = self.cameras(step)
-        samples = self.field_losses.draw(step)
-        surface = self.extractor(self.field, self.field_losses.with_tethers(samples))
+        asked = self.field_losses.ask(step)
+        surface = self.extractor(self.field, asked.samples if asked is not None else None)
         losses: dict[str, Tensor] = {}
         values: dict[str, float] = {}
         pictures, preview = torch.zeros(0), None
@@ -174,10 +174,11 @@ class GeometryStage:
             losses["sds"], preview = result.loss, result.preview
             values.update(processes().values_of_all(result.logs))
             self._watch_visibility(pictures)
-        if samples is not None:
-            losses.update(self.field_losses(surface.sample_sdf, samples, step))
+        if asked is not None:
+            losses.update(self.field_losses(surface.sample_sdf, asked, step))
         weights = {"sds": geometry.lambda_sds, **self.field_losses.weights}
         remedy = "lower geometry.learning_rate or guidance.guidance_scale"
+        fade(self.optimiser, geometry, step)
         values.update(descend(self.optimiser, losses, weights, step, remedy))
         if self.average is not None:
             self.average.update(self.field, step)
@@ -265,7 +266,7 @@ class GeometryStage:
         kind = SubtractionExtractor if self.scene.subtracts else SurfaceExtractor
         return kind(
             self.grid, self.sdf_base, self.start_sdf, active, geometry.union_k, geometry.union_only_outside,
-            depth=tether_depth(geometry, self.grid, self.scene.subtracts),
+            depth=asked_depth(geometry, self.grid, self.scene.subtracts),
         )  # fmt: skip
 
     def _start(self, points: np.ndarray, regions: Tensor) -> Tensor:
