@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,9 +10,26 @@ from torch import Tensor
 STENCIL = tuple((x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if abs(x) + abs(y) + abs(z) < 3)
 """A vertex of the grid and the 18 around it that share a face or an edge of a cell with it, as steps along x, y, z."""
 
-_PLACE = {step: place for place, step in enumerate(STENCIL)}
-_AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 _LEAST_SLOPE = 0.1
+_MIXED = ((0, 1), (0, 2), (1, 2))
+
+
+def _differences() -> Tensor:
+    """(19, 9): central differences of values at `STENCIL`: along x, y, z; xx, yy, zz; xy, xz, yz."""
+    rows = np.zeros((len(STENCIL), 9), np.float32)
+    for row, step in zip(rows, STENCIL, strict=True):
+        for axis in range(3):
+            alone = abs(step[axis]) == sum(map(abs, step)) == 1
+            row[axis] = step[axis] / 2 if alone else 0
+            row[3 + axis] = 1 if alone else -2 if not any(step) else 0
+        for column, (one, other) in enumerate(_MIXED, 6):
+            row[column] = step[one] * step[other] / 4
+    return torch.from_numpy(rows)
+
+
+_DIFFERENCES = _differences()
+_SYMMETRIC = torch.tensor([[3, 6, 7], [6, 4, 8], [7, 8, 5]])
+"""Columns of the second differences as a matrix."""
 
 
 def loss_curvature(sdf_part: Float[Tensor, "N 19"], spacing: float, edge: float = 0.5) -> Float[Tensor, ""]:
@@ -31,31 +49,11 @@ def loss_curvature(sdf_part: Float[Tensor, "N 19"], spacing: float, edge: float 
     """
     if not len(sdf_part):
         return sdf_part.sum()
-    values = sdf_part / spacing
-
-    def at(*steps: tuple[int, int, int]) -> Tensor:
-        return values[:, _PLACE[tuple(int(sum(axis)) for axis in zip(*steps, strict=True))]]  # type: ignore[index]
-
-    back = tuple(tuple(-number for number in axis) for axis in _AXES)
-    slope = torch.stack([(at(axis) - at(away)) / 2 for axis, away in zip(_AXES, back, strict=True)], dim=1)
-    bend = torch.stack(
-        [
-            torch.stack(
-                [
-                    at(_AXES[i]) + at(back[i]) - 2 * at((0, 0, 0))
-                    if i == j
-                    else (at(_AXES[i], _AXES[j]) - at(_AXES[i], back[j]) - at(back[i], _AXES[j]) + at(back[i], back[j]))
-                    / 4
-                    for j in range(3)
-                ],
-                dim=1,
-            )
-            for i in range(3)
-        ],
-        dim=1,
-    )
+    differences = sdf_part / spacing @ _DIFFERENCES.to(sdf_part.dtype)
+    slope = differences[:, :3]
+    bend = differences[:, _SYMMETRIC]
     length = slope.norm(dim=1, keepdim=True).clamp(min=_LEAST_SLOPE)
     normal = slope / length
-    flat = torch.eye(3, dtype=values.dtype) - normal[:, :, None] * normal[:, None, :]
+    flat = torch.eye(3, dtype=slope.dtype) - normal[:, :, None] * normal[:, None, :]
     squared = ((flat @ bend @ flat) / length[..., None]).square().sum(dim=(1, 2))
     return (squared / (1 + squared / edge**2)).mean()
