@@ -111,7 +111,7 @@ class GeometryConfig(OptimisedSection):
     lambda_tether: Weight = 0.0
     """Weight of the loss that keeps pieces of the part from coming loose from the base; not in the paper."""
     lambda_curvature: Weight = 0.0
-    """Weight of the price of curvature of the part's surface, edges apart; not in the paper."""
+    """Weight of a penalty on curvature of the part's surface that spares edges; not in the paper."""
     losses: dict[str, Weighted] = {}
     """Losses of other modules by name, each with its `lambda` and its own settings; see docs/extending.md."""
     views: Views = 4

@@ -25,6 +25,7 @@ from fd_mitsuba.training.tethers import THIN, Tethers
 RIM_IN_CELLS = 2.0
 """Within this distance of the base a part touches it: the soft union joins them."""
 _STENCILS = 512
+"""Places beside the surface at which a step looks at its curvature, at most: 2 % of a step's time."""
 
 
 class FieldLosses:

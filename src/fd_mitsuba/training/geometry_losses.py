@@ -190,7 +190,7 @@ class Tether(FieldLoss):
 
 @GEOMETRY_LOSSES.register("curvature")
 class Curvature(FieldLoss):
-    """Dents and creases of the part's surface have a price; see `loss_curvature`. A cut should be as the base was."""
+    """A penalty on dents and creases of the part's surface; see `loss_curvature`. A cut should be as the base was."""
 
     in_cuts = False
 
