@@ -27,7 +27,7 @@ _BAND_CELLS = 3.5
 """Values are exact so far from the base, in cells of the training; the fillet and the sink are half as wide."""
 _FAR_CELLS = 4.0
 """Distances are cut off here."""
-_SMOOTH_CELLS = 0.75
+_SMOOTH_CELLS = 0.9
 """Standard deviation of the Gaussian. The joint lies further than this from what makes it."""
 
 

@@ -20,10 +20,11 @@ import numpy as np
 import torch
 
 from fd_mitsuba.export.final_surface.contact import contact_of
+from fd_mitsuba.export.final_surface.fillet import fillet_reach, foot_width
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.learned import learned_spline
 from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
-from fd_mitsuba.export.final_surface.part_function import PartFunction, fillet_reach
+from fd_mitsuba.export.final_surface.part_function import PartFunction
 from fd_mitsuba.export.final_surface.rim import rim_normals
 from fd_mitsuba.export.final_surface.shading import smooth_normals
 from fd_mitsuba.export.solid.decimation import decimated
@@ -118,7 +119,7 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
     extractor, grid = grown.extractor, coarse.grid
     base = None if coarse.cuts else MeshDistance(grown.base.vertices, grown.base.faces)
 
-    reach = fillet_reach(extractor.union_k, _FILM_CELLS * grid.spacing)
+    reach = foot_width(extractor.union_k, grid.spacing) + fillet_reach(extractor.union_k, _FILM_CELLS * grid.spacing)
     function = PartFunction(
         learned_spline(grown), list(grown.parts.values()), coarse.number, grid, base, extractor.union_k,
         extractor.union_only_outside, reach, coarse.sink, _lattice(coarse, coarse.sdf_base), coarse.bridges,

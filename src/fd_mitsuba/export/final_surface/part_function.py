@@ -1,19 +1,20 @@
 """A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
 
     part   = min(region + learned, region + margin, room)      where the part may be at all
-    blend  = part, but -away at the base's surface and inside it, from one to the other within 0.4 k
+    blend  = part, but foot - away at the base's surface and inside it, from one to the other within 0.5 k
     joined = max(sdf_base - 2 max(away - reach, 0), blend) + fillet(sdf_base, blend)
     value  = min(joined, sink - sdf_base, lead)        positive inside the solid
 
 `sdf_base` is the exact distance to triangles, `region` that to the focal regions, and `learned` a spline through what
 the field adds to it at the vertices of the training's lattice (`learned`). See `part_solid` for `joined`, `sink` and
 `lead`. `away` is the smoothed distance to where the part is seen to stand on the base (`contact`): the curve along
-which the solid dives under the base, two down for one along, is a level line of it. The edge at `sink` is rounded.
+which the solid dives under the base, two down for one along, is a level line of it. The part widens by `foot` towards
+the base: smoothed distances shrink what is thin, which would leave a groove around the part. The edge at `sink` is
+rounded.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.export.final_surface.fillet import fillet, foot_width, rounded_minimum, smoothstep
 from fd_mitsuba.export.final_surface.projection import FLATTEST
 from fd_mitsuba.export.final_surface.spline import LatticeSpline
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
@@ -29,6 +31,8 @@ from fd_mitsuba.extraction.tet_grid import TetGrid
 from fd_mitsuba.scene.focal_region import FocalRegion, union_sdf
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 
+_BLEND = 0.5
+"""How far over the base the part becomes the smoothed one, in `k`."""
 _STEP = 1e-3
 """Of the differences that a region's gradient is made of, canonical units."""
 _AT_ONCE = 1 << 16
@@ -36,16 +40,6 @@ _DIVE = 2.0
 """How steeply the solid dives under the base: a steep rim lies where it lies, whatever the triangles beside it."""
 _ROUND_CELLS = 0.75
 """Of the solid's lower edge, which nobody sees: triangles across a sharp one would be off its surface."""
-
-
-def over_base(union_k: float) -> float:
-    """How wide the fillet is over the base, canonical units; see `PartFunction`."""
-    return 0.4 * union_k
-
-
-def fillet_reach(union_k: float, film: float) -> float:
-    """How far from the part the fillet is higher than `film` over a flat base, canonical units."""
-    return over_base(union_k) * max(1 - math.sqrt(10 * film / max(union_k, 1e-12)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -170,30 +164,12 @@ class PartFunction:
 
     def _joined(self, base: Tensor, part: Tensor, away: Tensor, lower: Tensor | float) -> Tensor:
         if self.width > 0:
-            part = torch.lerp(part, -away, smoothstep(1 + base / over_base(self.width)))
+            foot = foot_width(self.width, self.grid.spacing)
+            part = torch.lerp(part, foot - away, smoothstep(1 + base / (_BLEND * self.width)))
         higher = torch.maximum(base - lower, part)
-        fillet = self._fillet(base, part)
+        added = fillet(base, part, self.width)
         # Beyond the rim the fillet goes on below the base's surface, or the solid would end on it in a ledge.
-        return higher + (torch.where(higher < 0, fillet, 0.0) if self.union_only_outside else fillet)
-
-    def _fillet(self, base: Tensor, part: Tensor) -> Tensor:
-        """The fillet (N,): as high where base and part meet as that of `soft_union`, without the crease that it leaves.
-
-        Up the part it is as wide as `soft_union`'s, so that the shape and volume that were trained stay; over the base
-        it ends at `w = 0.4 k`, so that it does not run over what lies beside the part. With d = |base - part|:
-
-            over the base   0.1 k (1 - d / w)^2
-            up the part     0.1 k (1 - d / k)^2 - 0.3 d (1 - d / w)^2
-
-        Both have the slope -1/2 at d = 0, where that of the maximum is 1/2.
-        """
-        k, narrow = self.width, over_base(self.width)
-        if k == 0:
-            return torch.zeros_like(part)
-        apart = (base - part).abs()
-        wide, short = (1 - apart / k).clamp(min=0), (1 - apart / narrow).clamp(min=0)
-        short = short * short
-        return torch.where(base > part, 0.1 * k * short, 0.1 * k * wide * wide - 0.3 * apart * short)
+        return higher + (torch.where(higher < 0, added, 0.0) if self.union_only_outside else added)
 
     def _part(self, x: Tensor, swollen: bool) -> Tensor:
         region = self._region([region for regions in self.parts for region in regions], x)
@@ -251,18 +227,6 @@ class PartFunction:
             # One-sided: half the time for an error of half a step over the region's radius.
             gradient[:, axis] = (union_sdf(list(regions), points + step).astype(np.float64) - value) / _STEP
         return _attached(x, value, gradient)
-
-
-def rounded_minimum(one: Tensor, other: Tensor, width: float) -> Tensor:
-    """The lesser (N,) of two values, less what rounds the edge where they differ by less than `width`."""
-    overlap = (width - (one - other).abs()).clamp(min=0)
-    return torch.minimum(one, other) - overlap * overlap / (4 * width)
-
-
-def smoothstep(share: Tensor) -> Tensor:
-    """3 t^2 - 2 t^3 of the share (N,), t between 0 and 1."""
-    share = share.clamp(0, 1)
-    return share * share * (3 - 2 * share)
 
 
 def _attached(x: Tensor, value: np.ndarray, gradient: np.ndarray) -> Tensor:

@@ -22,6 +22,8 @@ _NEAR = 0.4
 """Vertices as near to the rim as this, in edges, are drawn to it."""
 _ON = 0.02
 """A vertex as near as this, in edges, is on it."""
+_BESIDE = 0.2
+"""A vertex so little before the rim, as a share of what is shaded beyond it, has faces that dive, too."""
 _BELOW = 2.0
 """How far below the fillet, in edges, the other end of an edge that starts on it can be."""
 _STEPS = 5
@@ -65,14 +67,14 @@ def without_crossings(
 
 
 def rim_normals(rim: Rim, vertices: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices (K,) lie on the rim or beyond it by up to `below`, and unit normals (K, 3) for them.
+    """Which vertices (K,) lie on the rim, just before it, or beyond it by up to `below`, and unit normals (K, 3) there.
 
     They are those of the fillet, as if it went on: what is seen between the rim and the base is a hair's breadth, and
     shaded as the flank that it is it would be a dark line around the part.
     """
     values, gradients = rim(vertices, 2 * below)
     side = values[:, 0] / np.maximum(np.linalg.norm(gradients[:, 0], axis=1), 1e-3)
-    chosen = np.flatnonzero((side > -_ON * below) & (side < below) & (np.abs(values[:, 1]) < _BELOW * below))
+    chosen = np.flatnonzero((side > -_BESIDE * below) & (side < below) & (np.abs(values[:, 1]) < _BELOW * below))
     slope = gradients[chosen, 1]
     length = np.linalg.norm(slope, axis=1)
     chosen, slope, length = chosen[length > 0.1], slope[length > 0.1], length[length > 0.1]

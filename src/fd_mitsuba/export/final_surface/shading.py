@@ -17,8 +17,8 @@ _WIDTH_CELLS = 0.26
 _A_ROUND = 0.6
 """That of one round, in edges."""
 _MOST_ROUNDS = 16
-_SHARPNESS = 16.0
-"""A neighbour counts cos(angle)^16: nine tenths at 6 degrees, next to nothing at an edge of 45."""
+_SHARPNESS = 8.0
+"""A neighbour counts cos(angle)^8: nine tenths at 9 degrees, a sixteenth at an edge of 45."""
 
 
 def smooth_normals(
