@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from fd_mitsuba.export.final_surface.contact import contact_of
-from fd_mitsuba.export.final_surface.fillet import fillet_reach, foot_width
+from fd_mitsuba.export.final_surface.fillet import fillet_reach, foot_width, shown_part
 from fd_mitsuba.export.final_surface.fine_lattice import FineLattice, refined
 from fd_mitsuba.export.final_surface.learned import learned_spline
 from fd_mitsuba.export.final_surface.meshing import edge_for, evenly_meshed
@@ -128,13 +128,14 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
         return function
     if coarse.bridges:
         start, _ = extractor.lattice_values(grown.field)
-        before = _surface_of(coarse, factor, start, lambda points: function.part_values(points, False))
+        before = _surface_of(coarse, factor, start, function.part_values)
         function = replace(function, surface=None if before is None else MeshDistance(*before))
-    own = _surface_of(coarse, factor, coarse.sdf_part, lambda points: function.part_values(points, True))
+    shown = shown_part(coarse.sdf_base, coarse.sdf_part, extractor.union_k)
+    own = _surface_of(coarse, factor, shown, function.shown_values)
     if own is None:
         return function
-    lattices = _lattice(coarse, coarse.sdf_base), _lattice(coarse, coarse.sdf_part)
-    contact = contact_of(grid, *lattices, base, own, lambda points: function.part_values(points, True) > 0)
+    lattices = _lattice(coarse, coarse.sdf_base), _lattice(coarse, shown)
+    contact = contact_of(grid, *lattices, base, own, lambda points: function.shown_values(points) > 0)
     return replace(function, contact=contact)
 
 

@@ -1,7 +1,8 @@
 """A part's solid as a function of space, not of a lattice: what `part_solid` marches, at any point, with its gradient.
 
     part   = min(region + learned, region + margin, room)      where the part may be at all
-    blend  = part, but foot - away at the base's surface and inside it, from one to the other within 0.5 k
+    shown  = part, and near the base what the training's union adds to it (`shown_part`)
+    blend  = shown, but foot - away at the base's surface and inside it, from one to the other within 0.5 k
     joined = max(sdf_base - 2 max(away - reach, 0), blend) + fillet(sdf_base, blend)
     value  = min(joined, sink - sdf_base, lead)        positive inside the solid
 
@@ -22,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.export.final_surface.fillet import fillet, foot_width, rounded_minimum, smoothstep
+from fd_mitsuba.export.final_surface.fillet import fillet, foot_width, rounded_minimum, shown_part, smoothstep
 from fd_mitsuba.export.final_surface.projection import FLATTEST
 from fd_mitsuba.export.final_surface.spline import LatticeSpline
 from fd_mitsuba.export.solid.part_pieces import Bridge, bridge_weight
@@ -81,10 +82,22 @@ class PartFunction:
         with torch.no_grad():
             return self._in_pieces(points, lambda x: self._compose(x)[:, None])[:, 0]
 
-    def part_values(self, points: np.ndarray, swollen: bool) -> np.ndarray:
-        """`part` (N,) alone, before or after it swells towards the base."""
+    def part_values(self, points: np.ndarray) -> np.ndarray:
+        """`part` (N,) alone, before it swells towards the base."""
         with torch.no_grad():
-            return self._in_pieces(points, lambda x: self._part(x, swollen)[:, None])[:, 0]
+            return self._in_pieces(points, lambda x: self._part(x, False)[:, None])[:, 0]
+
+    def shown_values(self, points: np.ndarray) -> np.ndarray:
+        """`shown` (N,) alone, after the part has swollen towards the base."""
+
+        def shown(x: Tensor) -> Tensor:
+            value, near = self._part(x, True), torch.from_numpy(np.flatnonzero(self._near_base(x)))
+            if len(near):
+                value = value.index_copy(0, near, shown_part(self._base_at(x[near]), value[near], self.width))
+            return value[:, None]
+
+        with torch.no_grad():
+            return self._in_pieces(points, shown)[:, 0]
 
     def with_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The value (N,) and its gradient (N, 3), float64; in a crease that of either side."""
@@ -120,9 +133,8 @@ class PartFunction:
         near = near[close]
         x = x[torch.from_numpy(near)].requires_grad_()
         away = _attached(x, from_part[close], slope[close])
-        for number, value in enumerate(
-            [away - self.reach, self._joined(self._base_at(x), self._part(x, True), away, 0)]
-        ):
+        base, part = self._base_at(x), self._part(x, True)
+        for number, value in enumerate([away - self.reach, self._joined(base, part, away, 0)]):
             (gradient,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
             values[near, number], gradients[near, number] = value.detach().numpy(), gradient.numpy()
         return values, gradients
@@ -165,6 +177,7 @@ class PartFunction:
     def _joined(self, base: Tensor, part: Tensor, away: Tensor, lower: Tensor | float) -> Tensor:
         if self.width > 0:
             foot = foot_width(self.width, self.grid.spacing)
+            part = shown_part(base, part, self.width)
             part = torch.lerp(part, foot - away, smoothstep(1 + base / (_BLEND * self.width)))
         higher = torch.maximum(base - lower, part)
         added = fillet(base, part, self.width)
