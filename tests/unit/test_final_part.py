@@ -117,6 +117,17 @@ def test_the_joint_is_one_smooth_circle() -> None:
     assert np.median(joint.sideways_deg) == pytest.approx(upright * np.degrees(1 / radius), rel=0.05)
 
 
+def test_a_wide_fillet_ends_too() -> None:
+    """One of eighteen cells: the rim is further from the part than any of a default run."""
+    stage = stage_of({"part": [(tuple(CENTRE), RADIUS)]}, resolution=64, k=0.6)
+    part = final_part(stage, None, 2 * FACES)
+    check(part.solid)
+    base, spacing = MeshDistance(stage.base.vertices, stage.base.faces), stage.grid.spacing
+    joint = measure_joint(part.solid.vertices, part.solid.faces, base, spacing)
+    assert part.distance.max() < 0.1 * spacing
+    assert joint.curves == 1 and np.percentile(joint.turning_deg, 95) < 1.3 * 360 / joint.length
+
+
 def joint_circle(stage: GrownPart) -> np.ndarray:
     """The distances from the y axis along the one curve in which the part meets the base."""
     solid = final_part(stage, None, FACES).solid

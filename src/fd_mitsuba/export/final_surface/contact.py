@@ -26,7 +26,8 @@ _FINER = 2
 _BAND_CELLS = 3.5
 """Values are exact so far from the base, in cells of the training; the fillet and the sink are half as wide."""
 _FAR_CELLS = 4.0
-"""Distances are cut off here."""
+"""Distances are cut off here, or so far beyond the rim: further out there is no solid any more."""
+_BEYOND_RIM_CELLS = 2.5
 _SMOOTH_CELLS = 0.9
 """Standard deviation of the Gaussian. The joint lies further than this from what makes it."""
 
@@ -38,6 +39,7 @@ def contact_of(
     base: MeshDistance,
     surface: tuple[np.ndarray, np.ndarray],
     in_part: Callable[[np.ndarray], np.ndarray],
+    reach: float,
 ) -> LatticeSpline | None:
     """The smoothed distance `a` from the contact of a part with the base; None where they do not come near each other.
 
@@ -46,13 +48,15 @@ def contact_of(
         part_lattice: (z, y, x) the part's.
         surface: vertices (V, 3) and faces (F, 3) of the part's own surface, closed.
         in_part: points (N, 3) -> whether they are in the part.
+        reach: the joint is where `a` has this value.
     """
     cell = grid.spacing
+    far = max(_FAR_CELLS * cell, reach + _BEYOND_RIM_CELLS * cell)
     seen = _outside(*surface, base)
     reached = np.abs(base_lattice) < (_BAND_CELLS + 1) * cell
     if part_lattice.max() > 0:
         apart = np.asarray(ndimage.distance_transform_edt(part_lattice <= 0, sampling=cell))
-        reached &= apart < (_FAR_CELLS + 2) * cell
+        reached &= apart < far + 2 * cell
     if seen is None or not reached.any():
         return None
     bounds = [slice(max(s.start - 1, 0), s.stop + 1) for s in ndimage.find_objects(reached.astype(np.int8))[0]]
@@ -64,7 +68,7 @@ def contact_of(
     points = origin + step * np.stack([x, y, z], axis=1)
     inside = base.inside(points)
     points[inside] = base.feet(points[inside])
-    distance = np.minimum(seen.unsigned(points), _FAR_CELLS * cell)
+    distance = np.minimum(seen.unsigned(points), far)
     raw = np.zeros(marked.shape)
     raw.reshape(-1)[index] = np.where(in_part(points), -distance, distance)
     nearest = np.asarray(ndimage.distance_transform_edt(~marked, return_distances=False, return_indices=True))

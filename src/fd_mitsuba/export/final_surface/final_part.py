@@ -135,7 +135,7 @@ def part_function(grown: GrownPart, coarse: LatticePart, factor: int) -> PartFun
     if own is None:
         return function
     lattices = _lattice(coarse, coarse.sdf_base), _lattice(coarse, shown)
-    contact = contact_of(grid, *lattices, base, own, lambda points: function.shown_values(points) > 0)
+    contact = contact_of(grid, *lattices, base, own, lambda points: function.shown_values(points) > 0, reach)
     return replace(function, contact=contact)
 
 
