@@ -14,6 +14,7 @@ from fd_mitsuba.export.final_surface.projection import project
 from fd_mitsuba.export.final_surface.remesh import remesh
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
 from fd_mitsuba.scene.mesh_distance import MeshDistance
+from fd_mitsuba.scene.tessellate import unit_sphere
 
 Function = Callable[[np.ndarray], np.ndarray]
 EDGE = 0.04
@@ -111,6 +112,28 @@ def test_a_tetrahedron_and_other_small_solids_survive() -> None:
         mesh = trimesh.Trimesh(made, triangles, process=False)
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
         assert (len(triangles) == 4) == (edge == 10.0)
+
+
+def test_folds_that_come_in_are_gone() -> None:
+    """A decimated mesh has some: a corner pushed across the opposite side turns a triangle over."""
+    vertices, faces = unit_sphere(3)
+    vertices, folded = vertices.astype(np.float64), faces[::97]
+    for a, b, c in folded:
+        vertices[a] += 1.3 * ((vertices[b] + vertices[c]) / 2 - vertices[a])
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+
+    def outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        corners = vertices[faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return np.einsum("ij,ij->i", cross, corners.mean(axis=1))
+
+    def onto(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points = points / np.linalg.norm(points, axis=1, keepdims=True)
+        return points, points
+
+    assert (outward(vertices, faces) < 0).sum() >= len(folded), "the premise"
+    made, triangles = remesh(vertices, faces, 0.12, onto, 4)
+    assert (outward(made, triangles) > 0).all() and len(triangles) > 0.8 * len(faces)
 
 
 def test_an_open_mesh_is_refused() -> None:
