@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 _WIDTH = 1.2
+"""Of the fillet, in `k`: five sevenths of it up the part, two over the base."""
 _OVER_BASE = 2 / 7 * _WIDTH
-"""In `k`: five sevenths of it up the part, two over the base."""
 _THICK = 0.13
 """What the union adds over the base is the part's from this thickness on, in `k`; its crease is at 0.1 k."""
 _FOOT_CELLS, _FOOT_SHARE = 0.3, 0.07
