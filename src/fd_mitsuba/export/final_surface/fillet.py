@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fd_mitsuba.fields.union import soft_union
+
 _WIDTH = 1.2
 """Of the fillet, in `k`: five sevenths of it up the part, two over the base."""
 _OVER_BASE = 2 / 7 * _WIDTH
@@ -29,17 +31,11 @@ def foot_width(union_k: float, cell: float) -> float:
 def shown_part(base: Tensor, part: Tensor, k: float) -> Tensor:
     """The part (N,) as the training's union shows it, where that is thicker than a film over the base.
 
-    With low = min(base, -0.13 k) it is
-
-        part + 0.1 (k - |part - low|)^2 / k      while |part - low| < k
-
-    what `soft_union` adds up the part; nearer to the base than 0.13 k it is as if that far. So what is thicker than
-    0.13 k over the base is as it was, down to the base, and what is not, is no part.
+    What `soft_union` adds to the part, but nearer to the base than 0.13 k as if that far from it. So what is thicker
+    than 0.13 k over the base is as it was, down to the base, and what is not, is no part.
     """
-    if k == 0:
-        return part
-    overlap = (k - (part - base.clamp(max=-_THICK * k)).abs()).clamp(min=0)
-    return part + 0.1 / k * overlap * overlap
+    low = base.clamp(max=-_THICK * k)
+    return part + (soft_union(low, part, k) - torch.maximum(low, part))
 
 
 def fillet(base: Tensor, part: Tensor, k: float) -> Tensor:

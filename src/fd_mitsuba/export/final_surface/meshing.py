@@ -10,10 +10,11 @@ import numpy as np
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
 from fd_mitsuba.export.final_surface.part_function import PartFunction
 from fd_mitsuba.export.final_surface.projection import FLATTEST, project
-from fd_mitsuba.export.final_surface.remesh import halved, remesh, tidied, unfolded
+from fd_mitsuba.export.final_surface.remesh import halved, remesh, tidied
 from fd_mitsuba.export.final_surface.rim import drawn_to_rim, without_crossings
 from fd_mitsuba.export.final_surface.slivers import without_slivers
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
+from fd_mitsuba.export.final_surface.unfolding import unfolded
 
 _SHORTEST_CELLS = 0.2
 """Shorter edges than this, in cells of the training, show nothing more: the field's own cells are twice a cell."""

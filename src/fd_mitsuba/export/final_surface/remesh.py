@@ -20,7 +20,7 @@ from fd_mitsuba.export.final_surface.mesh_rings import (
     neighbours,
     summed,
 )
-from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
+from fd_mitsuba.export.final_surface.unfolding import inverted, unfolded
 
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (N, 3) -> the nearby points of the surface and the unit outward normals there, (N, 3) each."""
@@ -64,7 +64,7 @@ def remesh(
             if not changed:
                 break
         moved, normals = project(_slid(vertices, faces))
-        vertices = unfolded(vertices, moved, faces, free=_inverted(vertices, faces, normals))
+        vertices = unfolded(vertices, moved, faces, free=inverted(vertices, faces, normals))
     for _ in range(2):
         faces, _ = _flip(vertices, faces, rng)
     return vertices, faces
@@ -81,34 +81,6 @@ def tidied(vertices: np.ndarray, faces: np.ndarray, edge: float) -> tuple[np.nda
         if len(vertices) == count and not flipped:
             break
     return vertices, faces
-
-
-def unfolded(
-    before: np.ndarray,
-    after: np.ndarray,
-    faces: np.ndarray,
-    least_angle_deg: np.ndarray | float = 0.0,
-    free: np.ndarray | None = None,
-) -> np.ndarray:
-    """`after` (V, 3), but `before` around faces that turn over on the way, or get angles below `least_angle_deg`.
-
-    Args:
-        least_angle_deg: for all faces, or (F,) for each.
-        free: (F,) bool, the faces that may turn over.
-    """
-    after = after.copy()
-    cross = cross_of_faces(before, faces)
-    while True:
-        bad = np.einsum("ij,ij->i", cross, cross_of_faces(after, faces)) < 0
-        if free is not None:
-            bad &= ~free
-        if np.any(least_angle_deg):
-            bad |= smallest_angles(after, faces) < least_angle_deg
-        corners = np.unique(faces[bad])
-        corners = corners[(after[corners] != before[corners]).any(axis=1)]
-        if not len(corners):
-            return after
-        after[corners] = before[corners]
 
 
 def halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -251,13 +223,6 @@ def _slid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normal = summed(faces, cross, len(vertices))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     return vertices + move - normal * np.einsum("ij,ij->i", move, normal)[:, None]
-
-
-def _inverted(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Which faces (F,) look away from the surface's outward normals (V, 3): folds of the mesh that came in."""
-    cross, facing = cross_of_faces(vertices, faces), normals[faces].sum(axis=1)
-    scale = np.linalg.norm(cross, axis=1) * np.linalg.norm(facing, axis=1)
-    return np.einsum("ij,ij->i", cross, facing) < -0.5 * scale
 
 
 def _slivers(vertices: np.ndarray, faces: np.ndarray, cross: np.ndarray) -> np.ndarray:

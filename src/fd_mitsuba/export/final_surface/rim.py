@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 
 from fd_mitsuba.export.final_surface.mesh_rings import edges_of
-from fd_mitsuba.export.final_surface.remesh import unfolded
 from fd_mitsuba.export.final_surface.triangle_angles import smallest_angles
+from fd_mitsuba.export.final_surface.unfolding import unfolded
 
 Rim = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 """Points (N, 3) and a distance -> two values (N, 2), both 0 on the rim, and their gradients (N, 2, 3); infinite where
