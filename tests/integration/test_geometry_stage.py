@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,9 +17,10 @@ from fd_mitsuba.extraction.pieces import label_pieces
 from fd_mitsuba.guidance.interface import GuidanceResult, GuidanceViews
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.training.checkpoint import load_trained
-from fd_mitsuba.training.geometry_stage import VANISHED_AFTER, GeometryStage
+from fd_mitsuba.training.geometry_stage import GeometryStage
 from fd_mitsuba.training.loop import run_stage
 from fd_mitsuba.training.stage import StepRecord
+from fd_mitsuba.training.visibility import INVISIBLE, VANISHED_AFTER, watch_visibility
 
 
 class PullMask:
@@ -165,11 +165,8 @@ def test_the_tether_loss_hangs_a_loose_piece_on_the_base(stage: Callable[..., Ge
 
 @pytest.mark.parametrize("subtracts, words", [(False, "lower geometry.lambda_volume"), (True, "what is to go")])
 def test_what_to_do_about_a_part_that_nobody_sees(subtracts: bool, words: str) -> None:
-    stage = SimpleNamespace(
-        counters={"invisible_steps": VANISHED_AFTER - 1}, scene=SimpleNamespace(subtracts=subtracts)
-    )
     with pytest.raises(RunStopped, match=words):
-        GeometryStage._watch_visibility(stage, torch.zeros(1, 5, 2, 2))  # type: ignore[arg-type]
+        watch_visibility(torch.zeros(1, 5, 2, 2), {INVISIBLE: VANISHED_AFTER - 1}, subtracts)
 
 
 def test_a_resumed_run_goes_on_counting_invisible_steps(stage: Callable[..., GeometryStage], tmp_path: Path) -> None:

@@ -7,21 +7,19 @@ from pathlib import Path
 import diffusers
 import numpy as np
 import pytest
-import torch
 from tiny_pipelines import UNET_1_5, save_pipeline
 from tiny_runs import write_place
 
 from fd_mitsuba.baselines.editors_2d import instruction_for
-from fd_mitsuba.baselines.image_editors.sampling import sample, timesteps
 from fd_mitsuba.baselines.interface import EditTask
 from fd_mitsuba.baselines.methods import BASELINES
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import sds
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.geometry_stage import GeometryStage
 
 VIEWS = CameraBatch.around(np.array([30.0, 210.0]), 20.0, 3.4, 45.0)
 
@@ -35,54 +33,16 @@ def task(scene: EditScene, folder: Path, *overrides: str) -> EditTask:
     return EditTask(scene, RunConfig.load("quick", overrides), folder, lambda line: None)
 
 
-class Knows:
-    """A network that sees the clean latents `target` in every noisy image."""
-
-    alpha_bars = torch.linspace(0.9995, 0.005, 1000)
-    device = torch.device("cpu")
-
-    def __init__(self, target: torch.Tensor) -> None:
-        self.target = target
-
-    def predict_noise(self, z_t, timesteps, texts, beside):  # noqa: ANN001, ANN201
-        level = self.alpha_bars[timesteps].view(-1, 1, 1, 1)
-        return {name: (z_t - level.sqrt() * self.target) / (1 - level).sqrt() for name in texts}
-
-
-def test_sampling_arrives_at_what_the_network_sees_and_keeps_what_is_held() -> None:
-    generator = torch.Generator().manual_seed(0)
-    target, known, noise = (torch.randn(2, 4, 8, 8, generator=generator) for _ in range(3))
-    network, texts = Knows(target), {"text": torch.zeros(2, 1, 1)}
-    assert torch.allclose(sample(network, texts, {"text": 1.0}, None, 5, noise), target, atol=1e-3)
-    inside = torch.zeros(2, 1, 8, 8)
-    inside[..., :4] = 1
-    made = sample(network, texts, {"text": 1.0}, None, 5, noise, (inside, known))
-    assert torch.equal(made[..., 4:], known[..., 4:])
-    assert torch.allclose(made[..., :4], target[..., :4], atol=1e-3)
-    assert timesteps(3, 1000) == [979, 500, 20] and timesteps(1, 1000) == [979]
-
-
-def test_one_step_is_the_networks_first_estimate_with_both_scales() -> None:
-    """Closed form: e_hat = plain + 2 (image - plain) + 3 (text - image), from constants."""
-    noise = torch.randn(1, 4, 4, 4, generator=torch.Generator().manual_seed(1))
-    values = {"text": 0.3, "image": 0.2, "plain": 0.1}
-
-    class Constant(Knows):
-        def predict_noise(self, z_t, timesteps, texts, beside):  # noqa: ANN001, ANN201
-            return {name: torch.full_like(z_t, values[name]) for name in texts}
-
-    texts = {name: torch.zeros(1, 1, 1) for name in values}
-    network = Constant(noise)
-    made = sample(network, texts, sds.cfg_coefficients_with_image(3.0, 2.0), None, 1, noise)
-    level = network.alpha_bars[979]
-    e_hat = 0.1 + 2 * (0.2 - 0.1) + 3 * (0.3 - 0.2)
-    assert torch.allclose(made, (noise - (1 - level).sqrt() * e_hat) / level.sqrt(), atol=1e-5)
-
-
 def test_an_edit_as_an_instruction() -> None:
     assert instruction_for("a horse with two wings", "a horse") == "put two wings on a horse"
     assert instruction_for("a rabbit with a hat", "") == "put a hat on a rabbit"
     assert instruction_for("a golden cat", "a cat") == "turn it into a golden cat"
+
+
+def test_the_other_methods_are_guided_at_every_step(scene: EditScene, tmp_path: Path) -> None:
+    given = task(scene, tmp_path)
+    assert GeometryStage(scene, given.config, given.guidance).draft is not None  # type: ignore[arg-type]
+    assert given.own.draft is None
 
 
 def test_the_built_in_prior_edits_views_and_inpaints_regions(scene: EditScene, tmp_path: Path) -> None:

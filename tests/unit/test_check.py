@@ -213,9 +213,25 @@ def test_cost_of_runs_that_were_measured(
     monkeypatch.setattr("fd_mitsuba.runs.cost.cores_in_use", lambda: 2)  # as they were measured
     monkeypatch.setattr("fd_mitsuba.runs.cost.processor_speed", lambda: 104e9)
     scene = load_edit_scene(ROOT / "scenes" / "pegasus" / "scene.xml")
-    cost = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", more))
+    undrafted = [*more, "geometry.draft_fraction=0"]
+    cost = estimate_cost(scene, RunConfig.load(ROOT / "configs" / "quick.toml", undrafted))
     assert cost.seconds_per_step == pytest.approx(seconds, rel=0.2)
     assert cost.geometry_memory_mb == pytest.approx(megabytes, rel=0.15)
+
+
+def test_drafted_steps_cost_no_passes_and_the_pictures_are_drawn_once(
+    make_scene: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By counting: 4 views see the network twice in a step, and those of the picture 2 * 6 times in a run."""
+    monkeypatch.setattr("fd_mitsuba.runs.cost.processor_speed", lambda: 104e9)
+    scene = load_edit_scene(make_scene())
+
+    def seconds(*more: str) -> float:
+        return estimate_cost(scene, RunConfig.load("quick", more)).seconds_total
+
+    plain, some, more = (seconds(f"geometry.draft_fraction={share}") for share in (0, 0.4, 0.8))
+    passes = (some - more) / (0.4 * 400 * 4 * 2)
+    assert plain - some == pytest.approx(passes * (0.4 * 400 * 4 * 2 - 4 * 2 * 6), rel=1e-6)
 
 
 def test_cost_of_the_appearance_stage(make_scene: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,9 +111,13 @@ class EditTask:
 
     @cached_property
     def own(self) -> GeometryStage:
-        """Our own method's stage, not trained: the cameras of every step, the base, and the way to ask the guidance."""
+        """Our own method's stage, not trained: the cameras of every step, the base, and the way to ask the guidance.
+
+        Nothing is drafted: the other methods are guided at every step.
+        """
         guidance: Any = self.guidance  # what it does not count is the inner one's
-        return GeometryStage(self.scene, self.config, guidance)
+        geometry = self.config.geometry.model_copy(update={"draft_fraction": 0.0})
+        return GeometryStage(self.scene, self.config.model_copy(update={"geometry": geometry}), guidance)
 
     @property
     def guidance_calls(self) -> int:

@@ -62,6 +62,8 @@ class GuidanceConfig(Section):
     """Weight of a timestep; `guidance.sds` has the formulas."""
     timestep_range_coarse: Range = (0.02, 0.35)
     """Noise levels that are drawn in the coarse phase, as shares of all timesteps."""
+    timestep_range_drafted: Range = (0.02, 0.6)
+    """The same once the part has been drafted (`geometry.draft_fraction`): what it is to be is decided then."""
     timestep_range_refined: Range = (0.02, 0.35)
     """The same in the refined phase."""
     timestep_annealing: Literal["none", "linear", "sqrt"] = "none"

@@ -33,6 +33,8 @@ _NEWER = {
     "geometry.start_variety": 0.0,
     "geometry.lambda_curvature": 0.0,
     "geometry.fade": 0.0,
+    "geometry.draft_fraction": 0.0,
+    "guidance.timestep_range_drafted": [0.02, 0.6],
     "guidance.perp_neg": 0.0,
     "guidance.mask_margin": 2,
     "guidance.lora": [],
@@ -74,6 +76,7 @@ class RunConfig(Section):
     def _ranges_are_ordered(self) -> RunConfig:
         for section, name, low, high in (
             ("guidance", "timestep_range_coarse", 0, 1),
+            ("guidance", "timestep_range_drafted", 0, 1),
             ("guidance", "timestep_range_refined", 0, 1),
             ("cameras", "elevation_deg", -90, 90),
             ("cameras", "fov_deg", 1, 150),

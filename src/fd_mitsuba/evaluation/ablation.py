@@ -41,7 +41,7 @@ def _k(value: float, name: str) -> Row:
 
 
 def _t(low: float, high: float, name: str) -> Row:
-    ranges = tuple(f"guidance.timestep_range_{phase}=[{low}, {high}]" for phase in ("coarse", "refined"))
+    ranges = tuple(f"guidance.timestep_range_{phase}=[{low}, {high}]" for phase in ("coarse", "drafted", "refined"))
     return Row(name, f"t of the shape in {low}..{high}", ranges, "geometry")
 
 
@@ -54,7 +54,10 @@ def _colour_scale(value: float, name: str) -> Row:
     return Row(name, title, (f"appearance.guidance_scale={value:g}",), "appearance")
 
 
-_PAPER_LOSSES = tuple(f"geometry.lambda_{name}=0" for name in ("volume", "presence", "tether", "curvature"))
+_PAPER_LOSSES = (
+    *(f"geometry.lambda_{name}=0" for name in ("volume", "presence", "tether", "curvature")),
+    "geometry.draft_fraction=0",
+)
 """Without our own additions: a price on volume also takes away what hides in the base, where no picture holds it, and
 pulls in what leaves the region, so what L_GF and L_CA do by themselves shows only without it."""
 

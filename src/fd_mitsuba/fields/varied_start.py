@@ -10,6 +10,8 @@ long as the region and half as long, and the same at x and -x of the canonical f
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 _WAVES = 10
 _SPREAD = 0.4
@@ -38,3 +40,14 @@ def varied_start(region_sdf: np.ndarray, points: np.ndarray, variety: float, see
     across, along = points[:, :1] * directions[:, 0] * turns, (points[:, 1:] @ directions[:, 1:].T) * turns + phase
     waves = np.clip((1 + (np.cos(across) * np.sin(along)).mean(axis=1) / _SPREAD) / 2, 0, 1)
     return (region_sdf - variety * depth * waves).astype(np.float32)
+
+
+def start_of_regions(regions: Tensor, points: np.ndarray, variety: float, seed: int) -> Tensor:
+    """(N,) the largest of the `varied_start` of several regions; with `variety` 0 their union itself.
+
+    Args:
+        regions: (R, N) as `region_sdf` there.
+    """
+    if variety == 0:
+        return regions.amax(dim=0)
+    return torch.from_numpy(np.stack([varied_start(r.numpy(), points, variety, seed) for r in regions])).amax(dim=0)

@@ -23,6 +23,7 @@ from fd_mitsuba.guidance.conditions import Conditions
 from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.denoiser import Denoiser
 from fd_mitsuba.guidance.device import own_device, require_device
+from fd_mitsuba.guidance.drafter import DiffusionDrafter
 from fd_mitsuba.guidance.interface import AppearanceViews, GuidanceResult, GuidanceViews, NonFiniteGuidance, Phase
 from fd_mitsuba.guidance.loading import Components, load_components
 from fd_mitsuba.guidance.mosaic import tile_views
@@ -114,6 +115,11 @@ class DiffusionGuidance(Denoiser):
     def appearance_size(self) -> int:
         """Side in pixels of a view of the appearance stage that needs no resizing."""
         return self.picture_size("appearance")
+
+    @property
+    def drafter(self) -> DiffusionDrafter | None:
+        """Draws the edited object at once; None for a model that does not paint shapes on the base's."""
+        return DiffusionDrafter(self) if self.conventions.is_packed and self.has_image_pass else None
 
     def set_prompt(self, prompt: str, negative_prompt: str = "") -> list[str]:
         """Take the texts; returns the words that the model cannot know (none where it has CLIP's own vocabulary)."""

@@ -37,6 +37,7 @@ class GuidanceViews:
         regions: part -> (B, 1, R, R), the share of each pixel in which one of its focal regions comes first; given to
             a guidance that has a `region_size`, which is R.
         share: which of the step's views these are, where several processes share them; None: they are all.
+        drafted: whether the part follows what a `Drafter` has drawn, so that noise need not decide what it is to be.
     """
 
     pictures: torch.Tensor
@@ -46,6 +47,7 @@ class GuidanceViews:
     closeup: bool = False
     regions: Mapping[str, torch.Tensor] = field(default_factory=dict)
     share: slice | None = None
+    drafted: bool = False
 
     def __post_init__(self) -> None:
         shape = tuple(self.pictures.shape)
@@ -112,6 +114,31 @@ class GuidanceResult:
     preview: torch.Tensor | None = None
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """Attributes:
+    latents: (N, 4, L, L) clean latents of pictures or mosaics of the edited object.
+    part: (B, H, H) how surely each pixel of the views is something else than the base, in [0, 1].
+    change: how much is another thing than the base, as a mean over the latents in [0, 1].
+    """
+
+    latents: torch.Tensor
+    part: torch.Tensor
+    change: float
+
+
+class Drafter(Protocol):
+    """Draws the edited object, and leads to what was drawn. `drafter.DiffusionDrafter` is the one the package ships."""
+
+    def draw(self, views: GuidanceViews, seed: int) -> Drawn:
+        """Pictures of the edited object for views of the base."""
+        ...
+
+    def guide(self, pictures: torch.Tensor, drawn: Drawn, chosen: slice) -> GuidanceResult:
+        """The loss of pictures (B, 5, H, H) of the coarse phase: how far they are from the `chosen` latents."""
+        ...
+
+
 class Guidance(Protocol):
     """A source of guidance. `DiffusionGuidance` is the one the package ships.
 
@@ -119,6 +146,7 @@ class Guidance(Protocol):
     prompt), and `region_size` is the side in pixels at which `GuidanceViews.regions` must be given, or None.
     Optional, for models that see several views at once: `views_together`, of which the number of views must be a
     multiple. They are consecutive, share elevation and distance, and are evenly spread around the object.
+    Optional, for models that draw the edited object at once: `drafter`, a `Drafter` or None, for the coarse phase.
     Optional, for what learns from step to step: `learned_state()`, tensors by name, which checkpoints hold, and
     `load_learned_state(tensors)`, ValueError where they do not fit.
 

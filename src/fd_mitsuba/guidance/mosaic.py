@@ -18,3 +18,10 @@ def tile_views(pictures: Float[Tensor, "B C H W"], grid: int) -> Float[Tensor, "
         return pictures
     rows = pictures.reshape(count // grid**2, grid, grid, channels, height, width)
     return rows.permute(0, 3, 1, 4, 2, 5).reshape(-1, channels, grid * height, grid * width)
+
+
+def untile_views(mosaics: Float[Tensor, "M C gridH gridW"], grid: int) -> Float[Tensor, "B C H W"]:
+    """The pictures of mosaics: undoes `tile_views`."""
+    count, channels, height, width = mosaics.shape
+    rows = mosaics.reshape(count, channels, grid, height // grid, grid, width // grid)
+    return rows.permute(0, 2, 4, 1, 3, 5).reshape(-1, channels, height // grid, width // grid)

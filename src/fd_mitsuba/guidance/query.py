@@ -94,8 +94,16 @@ class Distillation:
         )
 
 
-def timestep_range(config: GuidanceConfig, appearance: AppearanceConfig, phase: Phase) -> tuple[float, float]:
-    """Between which shares of the model's timesteps a phase is guided."""
+def timestep_range(
+    config: GuidanceConfig, appearance: AppearanceConfig, phase: Phase, drafted: bool = False
+) -> tuple[float, float]:
+    """Between which shares of the model's timesteps a phase is guided.
+
+    Args:
+        drafted: see `GuidanceViews`; the coarse phase has a range of its own then.
+    """
+    if drafted and phase == "coarse":
+        return config.timestep_range_drafted
     ranges = {
         "coarse": config.timestep_range_coarse,
         "refined": config.timestep_range_refined,

@@ -34,7 +34,7 @@ class StepDraws:
 
     Args:
         config: random timesteps or, with `timestep_annealing`, the one that is due.
-        bounds: of a phase's timesteps, as shares of `levels`.
+        bounds: of the timesteps of a phase, drafted or not, as shares of `levels`.
         levels: the model's training timesteps.
         latent_size: cells a side of the latents.
         view_grid: pictures are mosaics of view_grid x view_grid views.
@@ -45,7 +45,7 @@ class StepDraws:
     def __init__(
         self,
         config: GuidanceConfig,
-        bounds: Callable[[Phase], tuple[float, float]],
+        bounds: Callable[[Phase, bool], tuple[float, float]],
         levels: int,
         latent_size: int,
         view_grid: int,
@@ -56,9 +56,11 @@ class StepDraws:
         self._shape = (4, latent_size, latent_size)
         self._views, self._together, self._device = view_grid**2, together, device
 
-    def of_step(self, count: int, step: int, steps_total: int, phase: Phase, seed: int) -> tuple[Tensor, Tensor]:
+    def of_step(
+        self, count: int, step: int, steps_total: int, phase: Phase, seed: int, drafted: bool = False
+    ) -> tuple[Tensor, Tensor]:
         """Of all `count` pictures of a step."""
-        generator, bounds = step_generator(seed, step, phase), self._bounds(phase)
+        generator, bounds = step_generator(seed, step, phase), self._bounds(phase, drafted)
         groups, annealing = count // self._together, self._config.timestep_annealing
         if annealing == "none":
             timesteps = sds.draw_timesteps(bounds, self._levels, groups, generator)
@@ -71,7 +73,8 @@ class StepDraws:
         self, views: GuidanceViews | AppearanceViews, step: int, steps_total: int, phase: Phase, seed: int
     ) -> tuple[Tensor, Tensor]:
         """`of_step` for these of the step's views."""
-        return self._own(views, *self.of_step(own_share(views)[1] // self._views, step, steps_total, phase, seed))
+        count, drafted = own_share(views)[1] // self._views, isinstance(views, GuidanceViews) and views.drafted
+        return self._own(views, *self.of_step(count, step, steps_total, phase, seed, drafted))
 
     def lesson(
         self, views: GuidanceViews | AppearanceViews, step: int, phase: Phase, seed: int

@@ -9,9 +9,10 @@ import numpy as np
 from fd_mitsuba.backend.speed import processor_speed
 from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import GuidanceConfig, RunConfig
-from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
+from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin, is_small_prior
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.drafter import STEPS as DDIM_STEPS
 from fd_mitsuba.guidance.interface import Phase
 from fd_mitsuba.guidance.network_passes import network_passes
 from fd_mitsuba.runs.cost_memory import memory_warning, run_memory
@@ -103,7 +104,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     slower = _GFLOPS * 1e9 / processor_speed()
     guided = geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
     speed = None if builtin or not guided else _speed(guidance)
-    passes = (1 - refined) * _passes(scene, config, "coarse") + refined * _passes(scene, config, "refined")
+    passes = (1 - refined) * _coarse_passes(scene, config) + refined * _passes(scene, config, "refined")
     if speed is None:
         encoder = 0.0082 * slower * (0.75 + 0.5 / cores)  # four views are one picture to it; measured with two cores
         forward = encoder * (_FINER if guidance.model == BUILTIN_FINE else 1.0)
@@ -186,6 +187,16 @@ def _passes(scene: EditScene, config: RunConfig, phase: Phase) -> float:
     return views * network_passes(
         phase, guidance, config.appearance, with_image, views, scene.negative_prompt, negatives
     )
+
+
+def _coarse_passes(scene: EditScene, config: RunConfig) -> float:
+    """The same on average over the coarse phase: its drafted steps ask for none, but what they follow is drawn once."""
+    geometry, passes = config.geometry, _passes(scene, config, "coarse")
+    model, steps = config.guidance.model, geometry.steps * geometry.coarse_fraction
+    if scene.subtracts or not steps or not is_small_prior(model) or not network_size(model).has_image_pass:
+        return passes
+    drawing = geometry.views * 2 * DDIM_STEPS if geometry.draft_fraction else 0
+    return (1 - geometry.draft_fraction) * passes + drawing / steps
 
 
 def _appearance_step(scene: EditScene, config: RunConfig, forward: float, encoder: float, slower: float) -> float:

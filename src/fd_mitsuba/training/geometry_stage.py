@@ -25,23 +25,23 @@ from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.fields.base_shape import base_sdf
 from fd_mitsuba.fields.index_spaces import GridVertices
 from fd_mitsuba.fields.part_sdf import PartField
-from fd_mitsuba.fields.varied_start import varied_start
+from fd_mitsuba.fields.varied_start import start_of_regions
 from fd_mitsuba.guidance.interface import Guidance, GuidanceResult, GuidanceViews, Phase
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend, fade
+from fd_mitsuba.training.draft import Draft, Place
 from fd_mitsuba.training.field_losses import FieldLosses, asked_depth
 from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.stage import StepRecord
 from fd_mitsuba.training.step_views import check_views, step_views
+from fd_mitsuba.training.visibility import INVISIBLE, watch_visibility
 from fd_mitsuba.training.weight_average import WeightAverage
 from fd_mitsuba.viewing.sheets import geometry_sheet
 
-VANISHED_AFTER = 25
-"""Steps in a row without any visible part before the run is stopped."""
 EXPLODED_BEYOND = 1.0
 """A signed distance further than this from where it started, canonical units, is no shape any more."""
 
@@ -78,7 +78,7 @@ class GeometryStage:
                 f"{scene.path}: no vertex of the grid lies within a focal region; thicken them, or raise "
                 f"geometry.grid_resolution={geometry.grid_resolution}"
             )
-        self.start_sdf = self._start(points, regions)
+        self.start_sdf = start_of_regions(regions, points, self._variety(), seed_for(config.seed, Purpose.START))
         self.active = active_vertices(self.grid, self.region_sdf)
         self.extractor = self._extractor(self.active)
         self.field_losses = FieldLosses(
@@ -93,7 +93,10 @@ class GeometryStage:
         self._passes: dict[Phase, GeometryPass] = {}
         self._base_passes: dict[Phase, GeometryPass] = {}
         self._region_masks = RegionMasks(scene, config, guidance)
-        self.counters = {"invisible_steps": 0}
+        place = Place(base, self.extractor, self.region_sdf, self.focus)
+        planned = Draft.planned(config, guidance, self.coarse_steps, place, self._views_of_base)
+        self.draft = None if scene.subtracts else planned
+        self.counters = {INVISIBLE: 0}
         """Whole numbers that steps hand on to later ones; a checkpoint keeps them."""
 
     @property
@@ -119,6 +122,8 @@ class GeometryStage:
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
         """The step's views, and whether they are close-ups of the focal regions."""
+        if self.draft is not None and self.draft.has(step):
+            return self.draft.cameras, True
         seed = seed_for(self.config.seed, Purpose.VIEWS, step)
         count = self.config.geometry.views
         return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
@@ -161,6 +166,8 @@ class GeometryStage:
         geometry = self.config.geometry
         phase = self.phase_of(step)[0]
         cameras, closeup = self.cameras(step)
+        if self.draft is not None and step == 0:
+            self.draft.begin(self.field)
         asked = self.field_losses.ask(step)
         surface = self.extractor(self.field, asked.samples if asked is not None else None)
         losses: dict[str, Tensor] = {}
@@ -173,7 +180,7 @@ class GeometryStage:
             result = self.ask(pictures, cameras, closeup, step, share)
             losses["sds"], preview = result.loss, result.preview
             values.update(processes().values_of_all(result.logs))
-            self._watch_visibility(pictures)
+            watch_visibility(pictures, self.counters, self.scene.subtracts)
         if asked is not None:
             losses.update(self.field_losses(surface.sample_sdf, asked, step))
         weights = {"sds": geometry.lambda_sds, **self.field_losses.weights}
@@ -199,9 +206,14 @@ class GeometryStage:
         assert self.guidance is not None
         phase, phase_step, phase_length = self.phase_of(step)
         first = 0 if share is None else share.start
+        if self.draft is not None and self.draft.has(step):
+            drafted = self.draft.guide(pictures, first)
+            if drafted is not None:
+                return drafted
         base = self._render_base(cameras, phase, step, first) if self.guidance.needs_base else None
         regions = self._region_masks(cameras, step, first)
-        views = GuidanceViews(pictures, base, cameras.azimuth_deg, cameras.elevation_deg, closeup, regions, share)
+        angles = cameras.azimuth_deg, cameras.elevation_deg
+        views = GuidanceViews(pictures, base, *angles, closeup, regions, share, drafted=self.draft is not None)
         seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
         return self.guidance.guide(views, phase_step, phase_length, phase, seed)
 
@@ -255,6 +267,10 @@ class GeometryStage:
             static_faces=len(base.faces),
         )
 
+    def _views_of_base(self, cameras: CameraBatch) -> GuidanceViews:
+        base, regions = self._render_base(cameras, "coarse", 0, 0), self._region_masks(cameras, 0, 0)
+        return GuidanceViews(base, base, cameras.azimuth_deg, cameras.elevation_deg, True, regions)
+
     def _pass(self, passes: dict[Phase, GeometryPass], phase: Phase) -> GeometryPass:
         if phase not in passes:
             passes.clear()
@@ -269,28 +285,12 @@ class GeometryStage:
             depth=asked_depth(geometry, self.grid, self.scene.subtracts),
         )  # fmt: skip
 
-    def _start(self, points: np.ndarray, regions: Tensor) -> Tensor:
-        """The part's initial sdf. Seed 0 starts from the regions themselves, and so does whatever nothing guides."""
-        geometry, seed = self.config.geometry, self.config.seed
-        if seed == 0 or geometry.start_variety == 0 or geometry.lambda_sds == 0 or self.scene.subtracts:
-            return self.region_sdf
-        key = seed_for(seed, Purpose.START)
-        varied = [varied_start(region.numpy(), points, geometry.start_variety, key) for region in regions]
-        return torch.from_numpy(np.stack(varied)).amax(dim=0)
+    def _variety(self) -> float:
+        """0 for seed 0, which starts from the regions themselves, and where nothing guides and a start would stay."""
+        varies = self.config.seed != 0 and self.config.geometry.lambda_sds > 0 and not self.scene.subtracts
+        return self.config.geometry.start_variety if varies else 0.0
 
     def _base_surface(self) -> UnionSurface:
         with torch.no_grad():
             alone = self._extractor(GridVertices(torch.zeros(0, dtype=torch.int64)))
             return alone(PartField(self.config.field))
-
-    def _watch_visibility(self, pictures: Tensor) -> None:
-        visible = processes().sum(float(pictures[:, 4].detach().sum())) >= 0.5
-        self.counters["invisible_steps"] = 0 if visible else self.counters["invisible_steps"] + 1
-        if self.counters["invisible_steps"] >= VANISHED_AFTER:
-            raise RunStopped(
-                f"no cut has been visible for {VANISHED_AFTER} steps, so there seems to be nothing to take off; move "
-                "the focal region onto all of what is to go"
-                if self.scene.subtracts
-                else f"the part has been invisible for {VANISHED_AFTER} steps; move or enlarge the focal region, "
-                "or lower geometry.lambda_volume"
-            )

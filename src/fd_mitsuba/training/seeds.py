@@ -28,6 +28,7 @@ class Purpose(IntEnum):
     START = 15
     LOSSES = 16
     REGIONS = 17
+    DRAFT = 18
 
 
 def seed_for(run_seed: int, purpose: Purpose, step: int = 0) -> int:

@@ -6,15 +6,18 @@ view is one image of the model's full size, not a part of a mosaic: nothing ties
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from fd_mitsuba.baselines.image_editors.sampling import FIRST, sample, timesteps
 from fd_mitsuba.baselines.image_editors.views import Beginning, EditedViews
 from fd_mitsuba.baselines.interface import EditedImages, EditTask, mesh_images
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance.chunk import Beside
+from fd_mitsuba.guidance.ddim import FIRST, sample, timesteps
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.guidance.interface import GuidanceViews
 from fd_mitsuba.runs.own_meshes import base_mesh
@@ -91,11 +94,15 @@ class PriorEdit(EditedViews):
             held = None if inside is None else (inside[few], known[few])
             own = {name: text[few] for name, text in texts.items()}
             seed = seed_for(self.task.config.seed, Purpose.PIXELS, at)
-            rows.append(sample(guidance, own, self._coefficients, condition, self.steps, noise[few], held, seed, first))
+            noise_in = partial(self._noise_in, own, Beside(condition))
+            rows.append(sample(noise_in, guidance.alpha_bars, noise[few], self.steps, held, seed, first))
         latents = torch.cat(rows).float().cpu()
         mask = (latents[:, 3:] + 1) / 2 if guidance.latents.signed_mask else latents[:, 3:]
         mask = mask.clamp(0, 1)
         return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
+
+    def _noise_in(self, texts: dict[str, Tensor], beside: Beside, z: Tensor, now: Tensor) -> Tensor:
+        return sds.combine(self._guidance.predict_noise(z, now, texts, beside), self._coefficients)
 
     def _pictures(self, images: EditedImages) -> Tensor:
         return torch.cat([images.values, images.mask, images.mask], dim=1).to(self._guidance.device)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.chunk import Beside
-from fd_mitsuba.guidance.denoiser import Denoiser
 
 FIRST, LAST = 0.98, 0.02
 """Shares of the timesteps between which images are sampled: what the model is asked for when it guides, too."""
@@ -21,12 +21,10 @@ def timesteps(steps: int, levels: int, first: float = FIRST) -> list[int]:
 
 @torch.no_grad()
 def sample(
-    denoiser: Denoiser,
-    texts: dict[str, Tensor],
-    coefficients: dict[str, float],
-    condition: Tensor | None,
-    steps: int,
+    noise_in: Callable[[Tensor, Tensor], Tensor],
+    alpha_bars: Tensor,
     noise: Tensor,
+    steps: int,
     held: tuple[Tensor, Tensor] | None = None,
     seed: int = 0,
     first: float = FIRST,
@@ -34,8 +32,8 @@ def sample(
     """Clean latents (N, 4, L, L) after `steps` DDIM steps from noise (N, 4, L, L).
 
     Args:
-        texts: pass -> (N, length, width), those that `coefficients` name; see `sds.cfg_coefficients`.
-        condition: what the network sees beside the latents, for one that does.
+        noise_in: z_t (N, 4, L, L), timesteps (N,) -> the noise that the network sees in z_t, guidance included.
+        alpha_bars: of all timesteps, on the network's device.
         held: (N, 1, L, L) of zeros and ones and latents (N, 4, L, L). Outside of the ones, each step continues from
             these latents with noise of its level, and the result has them as they are (RePaint, arXiv 2201.09865,
             without its repeated steps).
@@ -43,15 +41,14 @@ def sample(
         first: share of the timesteps at which `noise` is; below `FIRST`, latents with the noise of that timestep.
     """
     generator = torch.Generator().manual_seed(seed)
-    times = timesteps(steps, len(denoiser.alpha_bars), first)
-    z, count = noise.to(denoiser.device), len(noise)
+    times = timesteps(steps, len(alpha_bars), first)
+    z, count = noise.to(alpha_bars.device), len(noise)
     for index, time in enumerate(times):
-        now = torch.full((count,), time, device=denoiser.device)
-        level = denoiser.alpha_bars[now]
-        seen = denoiser.predict_noise(z.float(), now, texts, Beside(condition))
-        noise_hat = sds.combine(seen, coefficients)
+        now = torch.full((count,), time, device=alpha_bars.device)
+        level = alpha_bars[now]
+        noise_hat = noise_in(z.float(), now)
         last = index + 1 == len(times)
-        following = None if last else denoiser.alpha_bars[torch.full_like(now, times[index + 1])]
+        following = None if last else alpha_bars[torch.full_like(now, times[index + 1])]
         if following is None:
             z = sds.clean_estimate(z, noise_hat, level)
         else:

@@ -1,0 +1,163 @@
+"""A part that is drafted before it is guided: after pictures of the edited object that the guidance draws at once.
+
+Image gradients move surfaces, and cannot make one where there is none: a region that shrinks onto antlers passes them
+by. So the field begins as the visual hull of what was drawn (`fields.visual_hull`), and the first steps follow the
+pictures themselves, always from the same close views, all around the focal regions. Pictures of one mosaic are of one
+part; those of several mosaics are of several. Views and pictures follow from the settings and the run's seed, so that a
+resumed run goes on with the same ones. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fd_mitsuba.config import CamerasConfig, RunConfig
+from fd_mitsuba.extraction.surface import SurfaceExtractor
+from fd_mitsuba.fields.part_sdf import PartField
+from fd_mitsuba.fields.visual_hull import hull_sdf, support
+from fd_mitsuba.guidance.interface import Drafter, Drawn, Guidance, GuidanceResult, GuidanceViews
+from fd_mitsuba.render.point_views import point_views
+from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.training.field_fit import fit_field
+from fd_mitsuba.training.seeds import Purpose, seed_for
+from fd_mitsuba.training.step_views import views_at_once
+
+_ZOOM = 1.4
+"""Half width of the pictures over the radius of the focal regions; in the middle of other close views'."""
+
+_LEAST_VERTICES = 20
+"""Of the grid, within a hull that is worth to be followed."""
+_AROUND_CELLS = 4
+"""How far around the regions the field is fitted."""
+
+ShowBase = Callable[[CameraBatch], GuidanceViews]
+"""The base's pictures from cameras, as a guidance takes them."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a part may be drafted.
+
+    Attributes:
+        base: canonical.
+        extractor: of the part's field.
+        region_sdf: (count,) to the focal regions, at the grid's vertices.
+        focus: centre and radius of what the pictures show, canonical.
+    """
+
+    base: TriangleMesh
+    extractor: SurfaceExtractor
+    region_sdf: Tensor
+    focus: tuple[np.ndarray, float]
+
+
+class Draft:
+    """What is drawn, and the way towards it.
+
+    Args:
+        steps: how many of the first steps follow the pictures.
+        cameras: of each of these steps, and of the pictures.
+        mosaic: consecutive cameras of a picture.
+        drafter: draws.
+        place: where.
+        show_base: what the drafter is shown.
+        seed: of what it draws.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        cameras: CameraBatch,
+        mosaic: int,
+        drafter: Drafter,
+        place: Place,
+        show_base: ShowBase,
+        seed: int,
+    ) -> None:
+        self.steps, self.cameras = steps, cameras
+        self._mosaic, self._drafter, self._place = mosaic, drafter, place
+        self._show_base, self._seed = show_base, seed
+
+    @classmethod
+    def planned(
+        cls, config: RunConfig, guidance: Guidance | None, coarse_steps: int, place: Place, show_base: ShowBase
+    ) -> Draft | None:
+        """The draft that the settings ask for; None: none, or a guidance that draws no shapes.
+
+        Args:
+            coarse_steps: of the run.
+        """
+        steps, drafter = round(config.geometry.draft_fraction * coarse_steps), getattr(guidance, "drafter", None)
+        if steps == 0 or drafter is None:
+            return None
+        mosaic = views_at_once(guidance)
+        cameras = draft_views(config.cameras, config.geometry.views, mosaic, place.focus)
+        return cls(steps, cameras, mosaic, drafter, place, show_base, seed_for(config.seed, Purpose.DRAFT))
+
+    def has(self, step: int) -> bool:
+        """Whether the step follows the pictures."""
+        return step < self.steps
+
+    @cached_property
+    def drawn(self) -> Drawn:
+        """The pictures."""
+        return self._drafter.draw(self._show_base(self.cameras), self._seed)
+
+    @cached_property
+    def hull(self) -> Tensor | None:
+        """(count,) signed distance to the hull of what was drawn in the regions, inside positive, canonical units.
+
+        None where that is next to nothing: what was drawn elsewhere, or not at all, is not to be followed.
+        """
+        place, grid = self._place, self._place.extractor.grid
+        points, room = grid.vertices.numpy(), (place.region_sdf > 0).numpy()
+        coverage = self.drawn.part.numpy()
+        views = point_views(place.base.vertices, place.base.faces, self.cameras, coverage.shape[-1], points[room])
+        known = np.full(len(points), np.nan)
+        known[room] = support(coverage, views.film, views.seen)
+        outside = (place.extractor.sdf_base < 0).numpy()
+        cells = hull_sdf(*(values.reshape((grid.side,) * 3) for values in (known, room & outside, ~room & outside)))
+        hull = torch.from_numpy(cells.ravel() * grid.spacing).float().minimum(place.region_sdf)
+        return hull if int((hull > 0).sum()) >= _LEAST_VERTICES else None
+
+    def begin(self, field: PartField) -> float | None:
+        """Fit the field to the hull; returns the mean error in cells, or None where there is no hull."""
+        if self.hull is None:
+            return None
+        extractor, grid = self._place.extractor, self._place.extractor.grid
+        near = torch.nonzero(self._place.region_sdf > -_AROUND_CELLS * grid.spacing).flatten()
+        start, target = extractor.initial_sdf[near], self.hull[near]
+        return fit_field(field, grid.vertices[near], start, target, grid.spacing, self._seed)
+
+    def guide(self, pictures: Tensor, first: int) -> GuidanceResult | None:
+        """The loss of a step; None where there is no hull, and so nothing to follow.
+
+        Args:
+            pictures: (B, 5, H, H) of the edited object, from some of the cameras.
+            first: which of them the first one is.
+        """
+        if self.hull is None:
+            return None
+        begin = first // self._mosaic
+        return self._drafter.guide(pictures, self.drawn, slice(begin, begin + len(pictures) // self._mosaic))
+
+
+def draft_views(settings: CamerasConfig, count: int, together: int, focus: tuple[np.ndarray, float]) -> CameraBatch:
+    """`count` close views all around, in the middle of the settings' elevations; the first looks at the front.
+
+    Args:
+        together: views of a mosaic, which are evenly spread; divides `count`.
+        focus: centre and radius of what they show, canonical.
+    """
+    turn, groups = 360.0 / together, count // together
+    azimuth = (np.arange(groups)[:, None] * turn / groups + np.arange(together) * turn).ravel()
+    sine = min(_ZOOM * float(focus[1]) / settings.radius, 1.0)
+    fov = min(float(np.mean(settings.fov_deg)), 2 * float(np.degrees(np.arcsin(sine))))
+    return CameraBatch.around(azimuth, float(np.mean(settings.elevation_deg)), settings.radius, fov, focus[0])
