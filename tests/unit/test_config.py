@@ -247,6 +247,7 @@ def test_settings_that_may_change_on_the_way_are_marked_at_the_field() -> None:
         assert RunConfig.load(None, others).content_hash(stage) == RunConfig().content_hash(stage)
     # Everything else counts, each setting by itself.
     newer = {f"geometry.{name}" for name in ("lambda_tether", "start_variety", "lambda_curvature", "fade")}
+    newer |= {"geometry.draft_fraction", "guidance.timestep_range_drafted"}
     newer |= {f"guidance.{name}" for name in ("perp_neg", "mask_margin", "lora", "lora_scale", "words")}
     newer |= {f"guidance.{name}" for name in ("mask_channel", "normal_augmentation", "refined_background", "reduction")}
     newer |= {f"guidance.{name}" for name in ("image_prompt", "image_prompt_scale", "ip_adapter", "ip_adapter_encoder")}
