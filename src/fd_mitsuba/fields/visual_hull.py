@@ -59,7 +59,7 @@ def hull_sdf(
     inside = (smooth > level) & (free | ~empty)
     if not inside.any():
         return np.full(known.shape, -np.inf)
-    outer, inner = (ndimage.distance_transform_edt(where) for where in (~inside, inside))
+    outer, inner = (np.asarray(ndimage.distance_transform_edt(where)) for where in (~inside, inside))
     distance = np.where(inside, inner - 0.5, 0.5 - outer)
     slope = np.sqrt(sum(np.square(change) for change in np.gradient(smooth)))
     between = np.clip((smooth - level) / np.maximum(slope, _LEAST_SLOPE), -1.5, 1.5)
