@@ -79,8 +79,9 @@ class GeometryConfig(OptimisedSection):
     """The part that is exported has an average of the field's weights over the steps, with this factor a step:
     smoother, and less sharp where the shape still changes. 0: the last step's own; not in the paper."""
     draft_fraction: Fraction = 0.0
-    """Share of the coarse phase's steps, the first ones, that follow pictures which the model has drawn of the edited
-    object, where it can: the built-in priors and their like. 0: none; not in the paper."""
+    """Share of the coarse phase's steps, the first ones, that follow a picture which the model draws of the edited
+    object, where it can: the built-in priors and their like. The part begins as the picture's visual hull. 0: nothing
+    is drawn; not in the paper."""
     grid_resolution: Annotated[int, Field(ge=8, le=256)] = 64
     """Cells a side of the tetrahedral grid: 64 has 275k vertices, 128 has 2.1M."""
     union_k: Length = 0.15
