@@ -91,8 +91,7 @@ class DiffusionDrafter:
     def _part(self, base: Tensor, drawn: Tensor) -> Tensor:
         """(B, H, H): 0 where no channel differs by 2 T, 1 where one does by 4 T, and 0 where the base is worn away."""
         away = (drawn - base).abs().amax(dim=1, keepdim=True)
-        there = (drawn[:, 3:] + 1) / 2 if self._guidance.latents.signed_mask else drawn[:, 3:]
-        surely = (away / (2 * TOLERANCE) - 1).clamp(0, 1) * (there > 0.5)
+        surely = (away / (2 * TOLERANCE) - 1).clamp(0, 1) * (self._guidance.latents.coverage(drawn) > 0.5)
         return untile_views(surely, self._guidance.view_grid)[:, 0]
 
 

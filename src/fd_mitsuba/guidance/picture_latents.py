@@ -73,6 +73,10 @@ class PictureLatents:
         """Latents as the encoder gives them."""
         return latents / self.scaling_factor + self.shift_factor
 
+    def coverage(self, latents: Tensor) -> Tensor:
+        """(N, 1, L, L) the mask that latents of the coarse phase hold; in [0, 1] for those of pictures."""
+        return (latents[:, 3:4] + 1) / 2 if self.signed_mask else latents[:, 3:4]
+
     def empty_mask(self, phase: Phase) -> float:
         """The mask at which a picture without normals has latents, or a VAE's input, of 0."""
         if phase == "coarse":

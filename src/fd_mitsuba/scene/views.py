@@ -135,12 +135,20 @@ def sample_views(
     zoom = random.uniform(1.2, 1.6, size=groups)
     if focus is not None:
         target = target + np.asarray(focus[0], dtype=np.float64)
-        sine = np.minimum(zoom * float(focus[1]) / cameras.radius, 1.0)
-        fov = np.minimum(fov, 2.0 * np.degrees(np.arcsin(sine)))
+        fov = np.minimum(fov, close_fov(zoom, focus[1], cameras.radius))
     elif centre is not None:
         target = target + np.asarray(centre, dtype=np.float64)
     elevation, fov, target = (np.repeat(values, together, axis=0) for values in (elevation, fov, target))
     return CameraBatch.around(azimuth, elevation, cameras.radius, fov, target)
+
+
+def close_fov(zoom: np.ndarray | float, ball_radius: float, distance: float) -> np.ndarray:
+    """Opening angle in degrees at which a ball of `zoom` times the radius touches the picture's borders.
+
+    Args:
+        distance: of the camera from the ball's centre; 180 degrees where it is within the ball.
+    """
+    return 2.0 * np.degrees(np.arcsin(np.minimum(zoom * float(ball_radius) / distance, 1.0)))
 
 
 def ring_views(count: int, elevation_deg: float = 20.0, fov_deg: float = 45.0, radius: float = 3.0) -> CameraBatch:

@@ -24,7 +24,7 @@ from fd_mitsuba.fields.visual_hull import hull_sdf, support
 from fd_mitsuba.guidance.interface import Drafter, Drawn, Guidance, GuidanceResult, GuidanceViews
 from fd_mitsuba.render.point_views import point_views
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-from fd_mitsuba.scene.views import CameraBatch
+from fd_mitsuba.scene.views import CameraBatch, close_fov
 from fd_mitsuba.training.field_fit import fit_field
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.step_views import views_at_once
@@ -158,6 +158,5 @@ def draft_views(settings: CamerasConfig, count: int, together: int, focus: tuple
     """
     turn, groups = 360.0 / together, count // together
     azimuth = (np.arange(groups)[:, None] * turn / groups + np.arange(together) * turn).ravel()
-    sine = min(_ZOOM * float(focus[1]) / settings.radius, 1.0)
-    fov = min(float(np.mean(settings.fov_deg)), 2 * float(np.degrees(np.arcsin(sine))))
+    fov = min(float(np.mean(settings.fov_deg)), float(close_fov(_ZOOM, focus[1], settings.radius)))
     return CameraBatch.around(azimuth, float(np.mean(settings.elevation_deg)), settings.radius, fov, focus[0])

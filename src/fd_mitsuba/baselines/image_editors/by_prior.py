@@ -97,8 +97,7 @@ class PriorEdit(EditedViews):
             noise_in = partial(self._noise_in, own, Beside(condition))
             rows.append(sample(noise_in, guidance.alpha_bars, noise[few], self.steps, held, seed, first))
         latents = torch.cat(rows).float().cpu()
-        mask = (latents[:, 3:] + 1) / 2 if guidance.latents.signed_mask else latents[:, 3:]
-        mask = mask.clamp(0, 1)
+        mask = guidance.latents.coverage(latents).clamp(0, 1)
         return EditedImages("normals", torch.minimum(torch.maximum(latents[:, :3], -mask), mask), mask)
 
     def _noise_in(self, texts: dict[str, Tensor], beside: Beside, z: Tensor, now: Tensor) -> Tensor:

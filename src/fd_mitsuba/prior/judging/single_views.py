@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from fd_mitsuba.evaluation.part_judge import VIEW_SIZE
+from fd_mitsuba.guidance.mosaic import untile_views
 
 
 def views_of(mosaics: np.ndarray) -> np.ndarray:
     """The views (4 N, C, S, S) of mosaics (N, C, 2 S, 2 S), those of one mosaic together, row by row."""
-    count, channels, side = *mosaics.shape[:2], mosaics.shape[2] // 2
-    split = mosaics.reshape(count, channels, 2, side, 2, side)
-    return split.transpose(0, 2, 4, 1, 3, 5).reshape(4 * count, channels, side, side)
+    return untile_views(torch.from_numpy(mosaics), 2).numpy()
 
 
 def seen_by_judge(views: np.ndarray) -> np.ndarray:
