@@ -22,17 +22,18 @@ FOCUS = np.array([0.0, 0.5, 0.1]), 0.3
 
 
 class Drawing:
-    """Draws a part that fills the middle of every view, or none; asks for more of the part; keeps what it is asked."""
+    """Draws a part in the views, by default in the middle of each; asks for more of it; keeps what it is asked."""
 
-    def __init__(self, there: bool = True) -> None:
+    def __init__(self, rows: tuple[slice, ...]) -> None:
         self.drawn_for: list[tuple[GuidanceViews, int]] = []
         self.followed: list[slice] = []
-        self.there = there
+        self.rows = rows
 
     def draw(self, views: GuidanceViews, seed: int) -> Drawn:
         self.drawn_for.append((views, seed))
         part = torch.zeros(len(views.pictures), 32, 32)
-        part[:, 8:24, 8:24] = float(self.there)
+        for view in range(len(part)):
+            part[view, self.rows[view % len(self.rows)], 8:24] = 1.0
         return Drawn(torch.zeros(len(part) // 4, 4, 64, 64), part, 0.5)
 
     def guide(self, pictures: torch.Tensor, drawn: Drawn, chosen: slice) -> GuidanceResult:
@@ -47,8 +48,8 @@ class DrawingGuidance:
     view_grid = 2
     normal_space = None
 
-    def __init__(self, there: bool = True) -> None:
-        self.drafter, self.steps, self.drafted = Drawing(there), [], []
+    def __init__(self, *rows: slice) -> None:
+        self.drafter, self.steps, self.drafted = Drawing(rows or (slice(8, 24),)), [], []
 
     def picture_size(self, phase: str) -> int:
         return 24
@@ -116,12 +117,22 @@ def test_the_field_begins_as_the_hull_within_the_regions(scene: EditScene) -> No
     assert np.linalg.norm(positions - stage.focus[0], axis=1).max() < 1.1 * 1.4 * stage.focus[1] / 2 * np.sqrt(3)
 
 
-def test_where_nothing_is_drawn_in_the_regions_every_step_is_guided(scene: EditScene) -> None:
-    guidance = DrawingGuidance(there=False)
+NOTHING, TOP, BOTTOM = slice(0, 0), slice(4, 12), slice(20, 28)
+
+
+@pytest.mark.parametrize("rows", [(NOTHING,), (TOP, BOTTOM, TOP, BOTTOM)], ids=["nothing", "another part in each view"])
+def test_where_no_one_part_is_drawn_every_step_is_guided_as_if_nothing_was(
+    scene: EditScene, rows: tuple[slice, ...]
+) -> None:
+    guidance = DrawingGuidance(*rows)
     stage = GeometryStage(scene, settings(), guidance)
-    assert stage.draft.begin(stage.field) is None
-    stage.step(0)
-    assert guidance.steps == [0] and guidance.drafter.followed == []
+    assert stage.draft.begin(stage.field) is None and not stage.draft.leads
+    plain = GeometryStage(scene, settings(draft_fraction=0.0), DrawingGuidance())
+    assert np.array_equal(stage.cameras(0)[0].azimuth_deg, plain.cameras(0)[0].azimuth_deg)  # not always the same ones
+    stage.step(0), plain.step(0)
+    assert guidance.steps == [0] and guidance.drafted == [False] and guidance.drafter.followed == []
+    for one, other in zip(stage.field.parameters(), plain.field.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_several_pictures_a_step_and_a_share_of_the_views(scene: EditScene) -> None:

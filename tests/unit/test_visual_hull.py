@@ -9,7 +9,7 @@ import trimesh
 
 from fd_mitsuba.config import FieldConfig
 from fd_mitsuba.fields.part_sdf import PartField
-from fd_mitsuba.fields.visual_hull import hull_sdf, support
+from fd_mitsuba.fields.visual_hull import explained, hull_sdf, support
 from fd_mitsuba.render.point_views import point_views
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.field_fit import fit_field
@@ -90,6 +90,20 @@ def test_points_land_where_the_cameras_formula_puts_them() -> None:
         depth = -(offset @ back[k])
         assert np.allclose(offset @ right[k], slope[:, 0] * depth, atol=1e-4)
         assert np.allclose(offset @ up[k], slope[:, 1] * depth, atol=1e-4)
+
+
+def test_pictures_of_one_shape_are_explained_and_those_of_several_are_not() -> None:
+    views = point_views(*triangle_far_away(), CAMERAS, SIZE, POINTS)
+    one = outlines(0.15, (0.2, 0.1, -0.2))
+    several = np.stack([outlines(0.15, (0.35 * k - 0.5, 0.45 - 0.3 * k, -0.2))[k] for k in range(len(CAMERAS))])
+    anywhere = np.ones((SIDE,) * 3, dtype=bool)
+    shares = []
+    for pictures in (one, several):
+        known = support(pictures, views.film, views.seen).reshape(anywhere.shape)
+        within = hull_sdf(known, anywhere, ~anywhere).ravel() > -0.5
+        shares.append(explained(pictures, views.film, views.seen & within))
+    assert shares[0] > 0.95 and shares[1] < 0.2
+    assert explained(np.zeros_like(one), views.film, views.seen) == 0
 
 
 def test_what_fewer_than_two_views_see_is_unknown_and_a_hull_of_nothing_is_nothing() -> None:

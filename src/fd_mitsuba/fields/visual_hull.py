@@ -37,6 +37,30 @@ def support(
     return np.where(seen.sum(axis=0) >= _LEAST_VIEWS, least, np.nan)
 
 
+def explained(
+    coverage: Float[np.ndarray, "B H H"], film: Float[np.ndarray, "B N 2"], shown: Bool[np.ndarray, "B N"]
+) -> float:
+    """The share of the pixels that the shape covers on or next to which a point of the hull lies, in [0, 1].
+
+    Small where the pictures are of no one shape: each of four pairs of antlers is right, and they have no branch in
+    common. 0 where the shape covers no pixel by half.
+
+    Args:
+        coverage: as in `support`.
+        film: of points within the hull and on its surface.
+        shown: whether the view sees them.
+    """
+    found = total = 0
+    for picture, place, visible in zip(coverage, film, shown, strict=True):
+        rows, columns = (np.floor(place[visible, axis]).astype(int) for axis in (1, 0))
+        hit = np.zeros(picture.shape, dtype=bool)
+        hit[rows, columns] = True
+        covered = picture > 0.5
+        found += int((ndimage.binary_dilation(hit) & covered).sum())
+        total += int(covered.sum())
+    return found / max(total, 1)
+
+
 def hull_sdf(
     known: Float[np.ndarray, "Z Y X"], free: Bool[np.ndarray, "Z Y X"], empty: Bool[np.ndarray, "Z Y X"]
 ) -> Float[np.ndarray, "Z Y X"]:

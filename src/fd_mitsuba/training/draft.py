@@ -20,7 +20,7 @@ from torch import Tensor
 from fd_mitsuba.config import CamerasConfig, RunConfig
 from fd_mitsuba.extraction.surface import SurfaceExtractor
 from fd_mitsuba.fields.part_sdf import PartField
-from fd_mitsuba.fields.visual_hull import hull_sdf, support
+from fd_mitsuba.fields.visual_hull import explained, hull_sdf, support
 from fd_mitsuba.guidance.interface import Drafter, Drawn, Guidance, GuidanceResult, GuidanceViews
 from fd_mitsuba.render.point_views import point_views
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
@@ -32,8 +32,8 @@ from fd_mitsuba.training.step_views import views_at_once
 _ZOOM = 1.4
 """Half width of the pictures over the radius of the focal regions; in the middle of other close views'."""
 
-_LEAST_VERTICES = 20
-"""Of the grid, within a hull that is worth to be followed."""
+_LEAST_VERTICES, _LEAST_EXPLAINED = 20, 1 / 3
+"""Of the grid within a hull that is worth to be followed, and of what was drawn, the share that it explains."""
 _AROUND_CELLS = 4
 """How far around the regions the field is fitted."""
 
@@ -103,7 +103,12 @@ class Draft:
 
     def has(self, step: int) -> bool:
         """Whether the step follows the pictures."""
-        return step < self.steps
+        return step < self.steps and self.leads
+
+    @property
+    def leads(self) -> bool:
+        """Whether what was drawn is one part in the regions, and so to be followed; else all steps are guided."""
+        return self.hull is not None
 
     @cached_property
     def drawn(self) -> Drawn:
@@ -114,7 +119,7 @@ class Draft:
     def hull(self) -> Tensor | None:
         """(count,) signed distance to the hull of what was drawn in the regions, inside positive, canonical units.
 
-        None where that is next to nothing: what was drawn elsewhere, or not at all, is not to be followed.
+        None where that is next to nothing, or little of what was drawn: elsewhere, or in several places at once.
         """
         place, grid = self._place, self._place.extractor.grid
         points, room = grid.vertices.numpy(), (place.region_sdf > 0).numpy()
@@ -125,7 +130,9 @@ class Draft:
         outside = (place.extractor.sdf_base < 0).numpy()
         cells = hull_sdf(*(values.reshape((grid.side,) * 3) for values in (known, room & outside, ~room & outside)))
         hull = torch.from_numpy(cells.ravel() * grid.spacing).float().minimum(place.region_sdf)
-        return hull if int((hull > 0).sum()) >= _LEAST_VERTICES else None
+        shown = views.seen & (hull.numpy()[room] > -0.5 * grid.spacing)
+        worth = explained(coverage, views.film, shown) >= _LEAST_EXPLAINED
+        return hull if worth and int((hull > 0).sum()) >= _LEAST_VERTICES else None
 
     def begin(self, field: PartField) -> float | None:
         """Fit the field to the hull; returns the mean error in cells, or None where there is no hull."""
@@ -136,15 +143,13 @@ class Draft:
         start, target = extractor.initial_sdf[near], self.hull[near]
         return fit_field(field, grid.vertices[near], start, target, grid.spacing, self._seed)
 
-    def guide(self, pictures: Tensor, first: int) -> GuidanceResult | None:
-        """The loss of a step; None where there is no hull, and so nothing to follow.
+    def guide(self, pictures: Tensor, first: int) -> GuidanceResult:
+        """The loss of a step that follows the pictures.
 
         Args:
             pictures: (B, 5, H, H) of the edited object, from some of the cameras.
             first: which of them the first one is.
         """
-        if self.hull is None:
-            return None
         begin = first // self._mosaic
         return self._drafter.guide(pictures, self.drawn, slice(begin, begin + len(pictures) // self._mosaic))
 

@@ -207,13 +207,12 @@ class GeometryStage:
         phase, phase_step, phase_length = self.phase_of(step)
         first = 0 if share is None else share.start
         if self.draft is not None and self.draft.has(step):
-            drafted = self.draft.guide(pictures, first)
-            if drafted is not None:
-                return drafted
+            return self.draft.guide(pictures, first)
         base = self._render_base(cameras, phase, step, first) if self.guidance.needs_base else None
         regions = self._region_masks(cameras, step, first)
         angles = cameras.azimuth_deg, cameras.elevation_deg
-        views = GuidanceViews(pictures, base, *angles, closeup, regions, share, drafted=self.draft is not None)
+        drafted = self.draft is not None and self.draft.leads
+        views = GuidanceViews(pictures, base, *angles, closeup, regions, share, drafted)
         seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
         return self.guidance.guide(views, phase_step, phase_length, phase, seed)
 
