@@ -134,6 +134,19 @@ def test_a_part_that_vanishes_stops_the_run(stage: Callable[..., GeometryStage])
             shrinker.check_field(step)
 
 
+def test_what_the_presence_loss_brings_back_may_be_gone_for_a_while(
+    stage: Callable[..., GeometryStage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Glasses are thinner than a cell. At the end there must be a part, and where nothing brings it back, always."""
+    for presence, stops_at in ((20.0, (60,)), (0.0, (30, 60))):
+        thin = stage(-1.0, lambda_presence=presence, steps=60)
+        deepest = thin.extractor.part_sdf(thin.field).max()
+        monkeypatch.setattr(thin.extractor, "part_sdf", lambda field, sdf=thin.extractor.part_sdf: sdf(field) - deepest)
+        for step in (30, 60):
+            with pytest.raises(RunStopped, match="vanished") if step in stops_at else nullcontext():
+                assert thin.check_field(step) == {"volume_ratio": 0.0}
+
+
 def test_the_presence_loss_leaves_no_region_empty(stage: Callable[..., GeometryStage]) -> None:
     """The pictures ask for no part at all, until nothing of it is left: without the loss, and not with it."""
     shrinker = stage(-1.0, lambda_focal=0.0, lambda_sds=1e-3, lambda_presence=1e3, presence_share=0.1)

@@ -32,6 +32,7 @@ from fd_mitsuba.scene.base_appearance import BaseAppearance
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.scene_copy import SceneCopy
+from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.studio.base_glb import only_parts
 
 ROOT = Path(__file__).parents[2]
@@ -229,6 +230,25 @@ def test_which_way_it_points_is_guessed_aloud(tmp_path: Path) -> None:
     assert not any("front" in line or "for up" in line for line in told.remarks)
     turned = load_edit_scene(told.scene).base[0].vertices
     assert np.ptp(turned[:, 0]) > np.ptp(turned[:, 2])  # its beak is at the side
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_long_animal_carries_its_head_before_it(tmp_path: Path, behind: bool) -> None:
+    """A body and a raised head, alike left and right: an OBJ says nothing of its front, a glTF does."""
+    vertices, faces = unit_sphere(3)
+    sign = -1.0 if behind else 1.0
+    beast = np.concatenate(
+        [vertices * [0.3, 0.3, 1.0] + [0, 0.6, 0], vertices * 0.25 + [0, 1.1, 0.9 * sign], vertices * [0.1, 0.3, 0.1]]
+    )
+    mesh = trimesh.Trimesh(beast, np.concatenate([faces + k * len(vertices) for k in range(3)]), process=False)
+    for suffix, turned in ((".obj", behind), (".glb", False)):
+        path = tmp_path / f"beast{suffix}"
+        mesh.export(path)
+        imported = fd.import_asset(path, tmp_path / f"scene{suffix}")
+        assert any("takes -z for its front (its higher part is there)" in line for line in imported.remarks) == turned
+        points = load_edit_scene(imported.scene, needs_region=False).base[0].vertices
+        head = points[np.argmax(points[:, 1])]
+        assert (head[2] > 0) == (turned or not behind)
 
 
 def test_smooth_faces_keep_sharp_edges() -> None:

@@ -53,13 +53,44 @@ def test_words_find_the_place(beast: ObjectPlaces, words: str, point: tuple, nor
     assert np.allclose(place.point, point, atol=0.1) and np.allclose(place.normal, normal, atol=0.1)
     # It is a point of the surface: one of the three ellipsoids, whose faces lie a little within.
     region = beast.region(place, 0.4)
-    assert np.allclose(region.centre - place.point, 0.7 * 0.2 * place.normal) and not region.subtracts
+    outwards = 0.0 if words == "front of the head" else 0.7  # what is worn on a face goes round it
+    assert np.allclose(region.centre - place.point, outwards * 0.2 * place.normal) and not region.subtracts
     cut = beast.region(place, 0.4, subtracts=True)
     assert np.allclose(cut.centre - place.point, -0.7 * 0.2 * place.normal) and cut.subtracts
 
 
 def test_front_and_rear_are_the_ends(beast: ObjectPlaces) -> None:
     assert beast.find("front").point[2] > 0.9 and beast.find("rear").point[2] < -0.9
+
+
+@pytest.mark.parametrize(
+    ("name", "height"),
+    # Read off the previews, by eye, as shares of the height: the eyes of rabbit, cat and person.
+    [("rabbit_glasses", 0.56), ("cat", 0.79), ("superhero", 0.90)],
+)
+def test_the_front_of_a_head_is_between_the_eyes(name: str, height: float) -> None:
+    mesh = load_edit_scene(SCENES / name / "scene.xml").base_soup
+    places = ObjectPlaces(mesh.vertices, mesh.faces)
+    place = places.find("front of the head")
+    size = places.high - places.low
+    assert abs((place.point - places.low)[1] / size[1] - height) < 0.05
+    assert abs((place.point - places.low)[0] / size[0] - 0.5) < 0.03
+    left, right = (places.find(f"{side} side of the head").point for side in ("left", "right"))
+    assert right[0] < place.point[0] < left[0] and abs(left[1] - place.point[1]) < 0.05 * size[1]
+    assert places.find("front of the head").name == "front_of_head"
+    assert places.find("left side of head").name == "left_side_of_head"
+    assert np.allclose(places.find("top of the head").point, places.find("head").point)
+
+
+def test_arms_and_pots_have_no_eyes() -> None:
+    """A figure without a neck, its arms out: its face is above them; of a column the face is high up."""
+    vertices, faces = unit_sphere(3)
+    pieces = [([0.2, 1.0, 0.2], [0, 1, 0]), ([0.9, 0.1, 0.1], [0, 1.3, 0])]
+    points = np.concatenate([vertices * radii + centre for radii, centre in pieces])
+    figure = ObjectPlaces(points, np.concatenate([faces, faces + len(vertices)]))
+    assert 1.4 < figure.find("front of the head").point[1] < 1.95
+    column = ObjectPlaces(vertices * [0.3, 1.0, 0.3] + [0, 1, 0], faces)
+    assert 1.4 < column.find("front of the head").point[1] < 1.95
 
 
 def test_the_back_of_what_stands_upright_is_behind() -> None:
@@ -151,6 +182,10 @@ def test_commands_take_places_and_assets(make_scene: Make, tmp_path: Path, capfd
     assert main(["check", box, "--prompt", "a box with a hat", "--at", "top", "--set", "geometry.lambda_sds=0"]) == 0
     out, err = capfd.readouterr()
     assert "prompt   a box with a hat" in out and "region   top" in out and err.count("\n") == 1
+    assert main(["check", scene, "--at", "-0.5,0.5,0", "--at", "-.5,.2,-1", "-c", "smoke"]) == 0  # no option is meant
+    assert capfd.readouterr().out.count("region   point") == 2
+    assert main(["check", box, "--prompt", "a box with a hat", "--at", "top", "--up", "z", "--front", "-x"]) == 0
+    assert "takes" not in capfd.readouterr().err
     off = ["--subtract", "--prompt", "a box without a hat", "--set", "guidance.model=builtin-fine"]
     for asked in ([scene, "--at", "head"], [box, "--at", "top"]):
         assert main(["check", *asked, *off]) == 0
@@ -161,6 +196,7 @@ def test_commands_take_places_and_assets(make_scene: Make, tmp_path: Path, capfd
         ([scene, "--size", "0.3"], "--size"),
         ([scene, "--subtract"], "--subtract: is for the regions of --at"),
         ([scene, "--at", "knee"], "--at knee"),
+        ([scene, "--at", "-1,2"], "--at -1,2"),
         ([scene, "--at", "head", "--regions", scene], "give one of the two"),
         ([box, "--at", "head", "--regions", scene], "give one of the two"),
         ([str(tmp_path / "none.glb")], "not found"),

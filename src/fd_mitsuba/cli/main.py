@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import shlex
 import signal
 import sys
@@ -38,6 +39,8 @@ from fd_mitsuba.errors import Interrupted, UserError, out_of_memory, printable
 from fd_mitsuba.io.safe_text import is_text
 
 _LONGEST_USAGE = 300
+_MAY_BE_NEGATIVE = ("--at", "--up", "--front")
+_NEGATIVE = re.compile(r"-[xyzXYZ]|-\.?\d.*")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -46,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if own_process:
         _open_standard_streams()
-    options = command_parser().parse_args(arguments)
+    options = command_parser().parse_args(_with_values_joined(arguments))
     if own_process:
         _exit_on_signals(options)
         for stream in (sys.stdout, sys.stderr):
@@ -87,6 +90,17 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         remark(f"error: {error.filename or 'output'}: {error.strerror or error}; free space or check the path")
         return 1
+
+
+def _with_values_joined(arguments: list[str]) -> list[str]:
+    """The arguments with `--front -y` and `--at -1,0,2` as `--front=-y`: argparse would take the values for options."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _MAY_BE_NEGATIVE and _NEGATIVE.fullmatch(argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def _leave(code: int) -> None:

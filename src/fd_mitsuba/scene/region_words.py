@@ -9,13 +9,15 @@ from functools import cached_property
 import numpy as np
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.scene.head_level import eye_level
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.picture_rays import pixel_ray
 
 DEFAULT_SIZE = 0.3
 """Of a region, as a share of the object's longest side."""
-_REACH = 0.3
-"""Share of a region's half axis by which it reaches into the object, or out of it where it subtracts."""
+_REACH, _REACH_OF_FACE = 0.3, 1.0
+"""Share of a region's half axis by which it reaches into the object, or out of it where it subtracts. What is worn on a
+face goes round it."""
 _SAMPLES = 20_000
 _UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
 _DIRECTIONS = {
@@ -39,12 +41,14 @@ class Place:
         point: (3,) on the surface.
         normal: (3,) unit, out of the object.
         about: what was understood, for people.
+        reach: share of its half axis by which a region there reaches into the object.
     """
 
     name: str
     point: np.ndarray
     normal: np.ndarray
     about: str
+    reach: float = _REACH
 
 
 @dataclass(frozen=True)
@@ -107,10 +111,10 @@ class ObjectPlaces:
         side = _SYNONYMS.get(of_head[1], of_head[1]) if of_head else words
         if of_head:
             side = {"back": "rear"}.get(side, side)
-        if of_head and side in _DIRECTIONS:
-            return self._side(_DIRECTIONS[side], f"{side}_of_head", self._head_points(), f"the {side} of its head")
-        if words == "head":
+        if words == "head" or (of_head and side == "top"):
             return self._side(_UP, "head", self._head_points(), "the top of its head")
+        if of_head and side in _DIRECTIONS:
+            return self._beside_head(_DIRECTIONS[side], f"{side}_of_head".replace(" ", "_"), f"the {side} of its head")
         if words == "back":
             if self._walks:
                 return self._side(_UP, "back", self._middle_points(), "its back, seen from above")
@@ -129,7 +133,7 @@ class ObjectPlaces:
         """
         extent = np.broadcast_to(np.asarray(size, dtype=np.float64), (3,))
         half = extent / 2
-        outwards = (_REACH - 1 if subtracts else 1 - _REACH) * half[1]
+        outwards = (_REACH - 1 if subtracts else 1 - place.reach) * half[1]
         centre = place.point + outwards * place.normal
         return PlacedRegion(name or place.name, centre, half, _upright(place.normal), subtracts)
 
@@ -154,11 +158,23 @@ class ObjectPlaces:
 
     def _head_points(self) -> np.ndarray:
         """The upper end of an upright object; of a long one the upper part of its front."""
-        points, size = self._points, self.high - self.low
-        if self._walks:
-            points = points[points[:, 2] > self.high[2] - 0.3 * size[2]]
-        top = points[:, 1].max()
-        return points[points[:, 1] > top - 0.25 * size[1]]
+        points = self._front_points()
+        return points[points[:, 1] > points[:, 1].max() - 0.25 * (self.high[1] - self.low[1])]
+
+    def _front_points(self) -> np.ndarray:
+        """Of a long object those of its front, of an upright one all."""
+        points = self._points
+        return points[points[:, 2] > self.high[2] - 0.3 * np.ptp(points[:, 2])] if self._walks else points
+
+    def _beside_head(self, direction: np.ndarray, name: str, about: str) -> Place:
+        """Where a ray from that side meets the head, at the height of its eyes or through what is there."""
+        around = eye_level(self._front_points(), self.find("head").point[1], float(self.high[1] - self.low[1]))
+        middle = np.quantile(around, (0.02, 0.98), axis=0).mean(axis=0)
+        hit = self._hit(middle + direction * (2 * self.longest_side), -direction)
+        if hit is None:
+            hit = around[np.argmax(around @ direction)]
+        reach = _REACH_OF_FACE if direction is _FRONT else _REACH
+        return Place(name, hit, direction.astype(np.float64), about, reach)
 
     def _middle_points(self) -> np.ndarray:
         points, size = self._points, self.high - self.low

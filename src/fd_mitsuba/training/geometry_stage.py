@@ -225,7 +225,7 @@ class GeometryStage:
         return GeometryPass(size, spp, geometry.silhouette_spp, geometry.normal_space)
 
     def check_field(self, step: int) -> dict[str, float]:
-        """The part's volume over the focal regions'; raises RunStopped for a field not finite, exploded or empty."""
+        """The part's volume over the focal regions'; RunStopped for a field not finite, exploded, or empty for good."""
         sdf = self.extractor.part_sdf(self.field)
         start = self.region_sdf[self.extractor.active_index]
         if not torch.isfinite(sdf).all():
@@ -237,7 +237,9 @@ class GeometryStage:
                 "lower geometry.learning_rate or geometry.lambda_sds"
             )
         inside = float((sdf > 0).sum()) / max(float((start > 0).sum()), 1.0)
-        if inside == 0.0:
+        # What the presence loss brings back may be thinner than a cell for a while; `watch_visibility` waits for it.
+        may_return = self.config.geometry.lambda_presence > 0 and step < self.steps
+        if inside == 0.0 and not may_return:
             raise RunStopped(
                 f"step {step}: the part vanished; raise geometry.lambda_presence, or lower geometry.lambda_volume or "
                 "guidance.guidance_scale"

@@ -1,0 +1,55 @@
+"""Where the eyes of a head are, as far as an outline tells: high up in the stretch in which the head is widest."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+_SLICES = 50
+"""Into which an object's height is cut."""
+_NECK, _SHOULDERS, _WIDE = 0.85, 1.5, 0.95
+"""Shares of the head's width: at most so wide is a neck, more than so wide are shoulders or arms, the eyes are where it
+is at least so wide."""
+_FIRST_SLICES = 4
+"""A head grows quickly wider at its top; nothing there is a shoulder."""
+
+
+def eye_level(points: Float[np.ndarray, "N 3"], top: float, height: float) -> Float[np.ndarray, "M 3"]:
+    """(M, 3) those of the points around the head at the height of its eyes; at least one.
+
+    From the top downwards, until it gets narrow as at a neck, or wide as at shoulders. Where no neck is found in the
+    upper half, as in a doll or a pot, the head counts as a quarter of the height.
+
+    Args:
+        points: of the surface, evenly by area, +y up; of an animal those of its front.
+        top: height of the head's top, of which ears and horns are no part.
+        height: of the whole object.
+
+    Raises:
+        ValueError: no point is below the top.
+
+    >>> ball = np.random.default_rng(0).normal(size=(4000, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> snowman = np.concatenate([ball, 2 * ball - [0, 2.8, 0]])
+    >>> bool(np.abs(eye_level(snowman, 1.0, 5.8)[:, 1]).max() < 0.35)
+    True
+    """
+    below = points[points[:, 1] <= top]
+    if not len(below):
+        raise ValueError("no point is below the head's top")
+    step = height / _SLICES
+    slices: list[np.ndarray] = []
+    widths: list[float] = []
+    necked = False
+    for number in range(_SLICES // 2):
+        found = below[np.abs(below[:, 1] - top + (number + 1) * step) <= step]
+        width = float(np.ptp(np.quantile(found[:, 0], (0.02, 0.98)))) if len(found) else 0.0
+        necked = bool(widths) and width < _NECK * max(widths)
+        if necked or (number >= _FIRST_SLICES and width > _SHOULDERS * max(widths)):
+            break
+        slices.append(found)
+        widths.append(width)
+    if not necked:
+        slices, widths = slices[: _SLICES // 4], widths[: _SLICES // 4]
+    wide = [found for found, width in zip(slices, widths, strict=True) if len(found) and width >= _WIDE * max(widths)]
+    return wide[len(wide) // 3] if wide else below
