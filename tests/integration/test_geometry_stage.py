@@ -141,7 +141,9 @@ def test_what_the_presence_loss_brings_back_may_be_gone_for_a_while(
     for presence, stops_at in ((20.0, (60,)), (0.0, (30, 60))):
         thin = stage(-1.0, lambda_presence=presence, steps=60)
         deepest = thin.extractor.part_sdf(thin.field).max()
-        monkeypatch.setattr(thin.extractor, "part_sdf", lambda field, sdf=thin.extractor.part_sdf: sdf(field) - deepest)
+        monkeypatch.setattr(
+            thin.extractor, "part_sdf", lambda _, sdf=thin.extractor.part_sdf(thin.field) - deepest: sdf
+        )
         for step in (30, 60):
             with pytest.raises(RunStopped, match="vanished") if step in stops_at else nullcontext():
                 assert thin.check_field(step) == {"volume_ratio": 0.0}
