@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -140,10 +141,8 @@ def test_what_the_presence_loss_brings_back_may_be_gone_for_a_while(
     """Glasses are thinner than a cell. At the end there must be a part, and where nothing brings it back, always."""
     for presence, stops_at in ((20.0, (60,)), (0.0, (30, 60))):
         thin = stage(-1.0, lambda_presence=presence, steps=60)
-        deepest = thin.extractor.part_sdf(thin.field).max()
-        monkeypatch.setattr(
-            thin.extractor, "part_sdf", lambda _, sdf=thin.extractor.part_sdf(thin.field) - deepest: sdf
-        )
+        sdf = thin.extractor.part_sdf(thin.field)
+        monkeypatch.setattr(thin.extractor, "part_sdf", MagicMock(return_value=sdf - sdf.max()))
         for step in (30, 60):
             with pytest.raises(RunStopped, match="vanished") if step in stops_at else nullcontext():
                 assert thin.check_field(step) == {"volume_ratio": 0.0}
