@@ -82,6 +82,15 @@ def test_the_front_of_a_head_is_between_the_eyes(name: str, height: float) -> No
     assert np.allclose(places.find("top of the head").point, places.find("head").point)
 
 
+@pytest.mark.parametrize("name", ["pegasus", "unicorn", "skateboard_dog", "wooden_horse", "cat"])
+def test_the_back_of_an_animal_is_not_its_neck(name: str) -> None:
+    """Heads begin above .75 of the height, and necks reach back into the middle two fifths of the length."""
+    mesh = load_edit_scene(SCENES / name / "scene.xml").base_soup
+    places = ObjectPlaces(mesh.vertices, mesh.faces)
+    share = (places.find("back").point - places.low) / (places.high - places.low)
+    assert abs(share[2] - 0.5) < 0.06 and abs(share[0] - 0.5) < 0.06 and 0.55 < share[1] < 0.75, share
+
+
 def test_arms_and_pots_have_no_eyes() -> None:
     """A figure without a neck, its arms out: its face is above them; of a column the face is high up."""
     vertices, faces = unit_sphere(3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,7 +19,7 @@ DEFAULT_SIZE = 0.3
 _REACH, _REACH_OF_FACE = 0.3, 1.0
 """Share of a region's half axis by which it reaches into the object, or out of it where it subtracts. What is worn on a
 face goes round it."""
-_SAMPLES = 20_000
+_SAMPLES, _BACK_SLICES = 20_000, 9
 _UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
 _DIRECTIONS = {
     "top": _UP, "bottom": -_UP, "front": _FRONT, "rear": -_FRONT, "left side": _LEFT, "right side": -_LEFT,
@@ -117,7 +118,7 @@ class ObjectPlaces:
             return self._beside_head(_DIRECTIONS[side], f"{side}_of_head".replace(" ", "_"), f"the {side} of its head")
         if words == "back":
             if self._walks:
-                return self._side(_UP, "back", self._middle_points(), "its back, seen from above")
+                return self._side(_UP, "back", self._back_points(), "its back, seen from above")
             return self._side(-_FRONT, "back", self._points, "its back, away from where it looks")
         if words in _DIRECTIONS:
             return self._side(_DIRECTIONS[words], words.replace(" ", "_"), self._points, f"its {words}")
@@ -180,6 +181,16 @@ class ObjectPlaces:
         points, size = self._points, self.high - self.low
         middle = (self.low[2] + self.high[2]) / 2
         return points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
+
+    def _back_points(self) -> np.ndarray:
+        """Of the middle a slice that no head reaches into: the nearest to its centre that is not much higher than all."""
+        points = self._middle_points()
+        along = points[:, 2]
+        edges = np.linspace(along.min(), along.max(), _BACK_SLICES + 1)
+        slices = [points[(along >= low) & (along <= high)] for low, high in pairwise(edges)]
+        tops = np.array([found[:, 1].max() if len(found) else np.inf for found in slices])
+        level = np.flatnonzero(tops <= tops.min() + 0.1 * (self.high[1] - self.low[1]))
+        return slices[level[np.argmin(np.abs(level - _BACK_SLICES // 2))]]
 
     def _side(self, direction: np.ndarray, name: str, points: np.ndarray, about: str) -> Place:
         """Where a ray from that side meets what is outermost there."""
