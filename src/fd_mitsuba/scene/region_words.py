@@ -183,9 +183,7 @@ class ObjectPlaces:
         return points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
 
     def _back_points(self) -> np.ndarray:
-        """A slice of the middle that no neck reaches over: of those that are not much higher than the lowest, the nearest
-        to the centre.
-        """
+        """A slice of the middle that no neck reaches over: not much higher than the lowest, and next to the centre."""
         points = self._middle_points()
         along = points[:, 2]
         edges = np.linspace(along.min(), along.max(), _BACK_SLICES + 1)
