@@ -91,6 +91,16 @@ def test_the_back_of_an_animal_is_not_its_neck(name: str) -> None:
     assert abs(share[2] - 0.5) < 0.06 and abs(share[0] - 0.5) < 0.06 and 0.55 < share[1] < 0.75, share
 
 
+@pytest.mark.parametrize("name", ["superhero", "skateboard_dog", "mug"])
+def test_the_bottom_is_where_it_stands_and_the_belly_above(name: str) -> None:
+    mesh = load_edit_scene(SCENES / name / "scene.xml").base_soup
+    places = ObjectPlaces(mesh.vertices, mesh.faces)
+    size = places.high - places.low
+    bottom, belly = (places.find(word).point for word in ("underside", "belly"))
+    assert bottom[1] == places.low[1] and (np.abs(bottom - places.low - size / 2)[[0, 2]] < 0.25 * size[[0, 2]]).all()
+    assert belly[1] >= bottom[1] and (belly[1] > bottom[1] + 0.2 * size[1]) == (name != "mug")
+
+
 def test_arms_and_pots_have_no_eyes() -> None:
     """A figure without a neck, its arms out: its face is above them; of a column the face is high up."""
     vertices, faces = unit_sphere(3)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.head_level import eye_level
+from fd_mitsuba.scene.body_outline import back_slice, eye_level
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.picture_rays import pixel_ray
 
@@ -19,7 +18,7 @@ DEFAULT_SIZE = 0.3
 _REACH, _REACH_OF_FACE = 0.3, 1.0
 """Share of a region's half axis by which it reaches into the object, or out of it where it subtracts. What is worn on a
 face goes round it."""
-_SAMPLES, _BACK_SLICES = 20_000, 9
+_SAMPLES = 20_000
 _UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
 _DIRECTIONS = {
     "top": _UP, "bottom": -_UP, "front": _FRONT, "rear": -_FRONT, "left side": _LEFT, "right side": -_LEFT,
@@ -27,7 +26,7 @@ _DIRECTIONS = {
 _SYNONYMS = {
     "above": "top", "below": "bottom", "underside": "bottom", "left": "left side", "right": "right side",
     "behind": "rear", "back side": "rear", "backside": "rear", "top of the head": "head", "on the head": "head",
-    "top of head": "head", "chest": "front", "belly": "bottom",
+    "top of head": "head", "chest": "front",
 }  # fmt: skip
 WORDS = ("top", "head", "back", "front", "rear", "left side", "right side", "bottom")
 """What `--at` knows, beside `front of the head` and the like, and points."""
@@ -39,7 +38,7 @@ class Place:
 
     Attributes:
         name: for the region there, of letters and `_`.
-        point: (3,) on the surface.
+        point: (3,) on the surface, or between the feet.
         normal: (3,) unit, out of the object.
         about: what was understood, for people.
         reach: share of its half axis by which a region there reaches into the object.
@@ -118,8 +117,11 @@ class ObjectPlaces:
             return self._beside_head(_DIRECTIONS[side], f"{side}_of_head".replace(" ", "_"), f"the {side} of its head")
         if words == "back":
             if self._walks:
-                return self._side(_UP, "back", self._back_points(), "its back, seen from above")
+                across = back_slice(self._middle_points(), float(self.high[1] - self.low[1]))
+                return self._side(_UP, "back", across, "its back, seen from above")
             return self._side(-_FRONT, "back", self._points, "its back, away from where it looks")
+        if words == "belly":
+            return self._side(-_UP, "belly", self._points, "its belly, seen from below")
         if words in _DIRECTIONS:
             return self._side(_DIRECTIONS[words], words.replace(" ", "_"), self._points, f"its {words}")
         raise UserError(f"--at {text}: is not known; say {', '.join(WORDS)}, 'front of the head', or x,y,z")
@@ -182,18 +184,8 @@ class ObjectPlaces:
         middle = (self.low[2] + self.high[2]) / 2
         return points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
 
-    def _back_points(self) -> np.ndarray:
-        """A slice of the middle that no neck reaches over: not much higher than the lowest, and next to the centre."""
-        points = self._middle_points()
-        along = points[:, 2]
-        edges = np.linspace(along.min(), along.max(), _BACK_SLICES + 1)
-        slices = [points[(along >= low) & (along <= high)] for low, high in pairwise(edges)]
-        tops = np.array([found[:, 1].max() if len(found) else np.inf for found in slices])
-        level = np.flatnonzero(tops <= tops.min() + 0.1 * (self.high[1] - self.low[1]))
-        return slices[level[np.argmin(np.abs(level - _BACK_SLICES // 2))]]
-
     def _side(self, direction: np.ndarray, name: str, points: np.ndarray, about: str) -> Place:
-        """Where a ray from that side meets what is outermost there."""
+        """Where a ray from that side meets what is outermost there; at the bottom, where it stands."""
         along = points @ direction
         reach = max(float(np.ptp(along)), 1e-300)
         middle = (self.low + self.high) / 2
@@ -208,6 +200,8 @@ class ObjectPlaces:
         if hit is None:
             near = points[along > along.max() - 0.15 * reach]
             hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
+        if name == "bottom":
+            hit = np.array([aim[0], self.low[1], aim[2]])
         return Place(name, hit, direction.astype(np.float64), about)
 
     def _point(self, text: str) -> Place:

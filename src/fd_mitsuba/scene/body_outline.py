@@ -1,6 +1,11 @@
-"""Where the eyes of a head are, as far as an outline tells: high up in the stretch in which the head is widest."""
+"""Where the eyes and the back of a body are, as far as its outline tells.
+
+Eyes are high up in the stretch in which a head is widest; the back of an animal is where no neck reaches over it.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +17,8 @@ _NECK, _SHOULDERS, _WIDE = 0.85, 1.5, 0.95
 is at least so wide."""
 _FIRST_SLICES = 4
 """A head grows quickly wider at its top; nothing there is a shoulder."""
+_BACK_SLICES, _LEVEL = 9, 0.1
+"""Into which the middle of an animal is cut, and how much of its height a back may rise above its lowest slice."""
 
 
 def eye_level(points: Float[np.ndarray, "N 3"], top: float, height: float) -> Float[np.ndarray, "M 3"]:
@@ -53,3 +60,23 @@ def eye_level(points: Float[np.ndarray, "N 3"], top: float, height: float) -> Fl
         slices, widths = slices[: _SLICES // 4], widths[: _SLICES // 4]
     wide = [found for found, width in zip(slices, widths, strict=True) if len(found) and width >= _WIDE * max(widths)]
     return wide[len(wide) // 3] if wide else below
+
+
+def back_slice(points: Float[np.ndarray, "N 3"], height: float) -> Float[np.ndarray, "M 3"]:
+    """(M, 3) those of the points that lie across the back: next to the centre, and not much higher than the lowest.
+
+    Args:
+        points: of the surface in the middle of an animal's length, evenly by area, +y up, +z ahead.
+        height: of the whole animal.
+
+    >>> neck = np.array([[0, 1.0, z] for z in np.linspace(-0.01, 0.2, 50)])
+    >>> trunk = np.array([[0, 0.6, z] for z in np.linspace(-0.2, 0.2, 100)])
+    >>> bool(back_slice(np.concatenate([neck, trunk]), 1.0)[:, 1].max() < 0.7)
+    True
+    """
+    along = points[:, 2]
+    edges = np.linspace(along.min(), along.max(), _BACK_SLICES + 1)
+    slices = [points[(along >= low) & (along <= high)] for low, high in pairwise(edges)]
+    tops = np.array([found[:, 1].max() if len(found) else np.inf for found in slices])
+    level = np.flatnonzero(tops <= tops.min() + _LEVEL * height)
+    return slices[level[np.argmin(np.abs(level - _BACK_SLICES // 2))]]
