@@ -112,6 +112,16 @@ def test_arms_and_pots_have_no_eyes() -> None:
     assert 1.4 < column.find("front of the head").point[1] < 1.95
 
 
+@pytest.mark.parametrize("words", ["head", "front of the head", "left side of the head", "back", "belly", "bottom"])
+def test_plates_and_objects_in_two_halves_have_places(words: str) -> None:
+    corners = np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 3, 2]])
+    halves = np.concatenate([corners * 0.1 + [0, 0, 2], corners * 0.1 - [0, 0, 2]])
+    for places in (ObjectPlaces(corners, faces), ObjectPlaces(halves, np.concatenate([faces, faces + 4]))):
+        place = places.find(words)
+        assert np.isfinite(place.point).all() and np.isclose(np.linalg.norm(place.normal), 1)
+
+
 def test_the_back_of_what_stands_upright_is_behind() -> None:
     vertices, faces = unit_sphere(3)
     upright = ObjectPlaces(vertices * [0.5, 1, 0.4], faces)

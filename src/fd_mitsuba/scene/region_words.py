@@ -182,7 +182,8 @@ class ObjectPlaces:
     def _middle_points(self) -> np.ndarray:
         points, size = self._points, self.high - self.low
         middle = (self.low[2] + self.high[2]) / 2
-        return points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
+        found = points[np.abs(points[:, 2] - middle) < 0.2 * size[2]]
+        return found if len(found) else points
 
     def _side(self, direction: np.ndarray, name: str, points: np.ndarray, about: str) -> Place:
         """Where a ray from that side meets what is outermost there; at the bottom, where it stands."""
