@@ -162,12 +162,12 @@ class ObjectPlaces:
     def _head_points(self) -> np.ndarray:
         """The upper end of an upright object; of a long one the upper part of its front."""
         points = self._front_points()
-        return points[points[:, 1] > points[:, 1].max() - 0.25 * (self.high[1] - self.low[1])]
+        return points[points[:, 1] >= points[:, 1].max() - 0.25 * (self.high[1] - self.low[1])]
 
     def _front_points(self) -> np.ndarray:
         """Of a long object those of its front, of an upright one all."""
         points = self._points
-        return points[points[:, 2] > self.high[2] - 0.3 * np.ptp(points[:, 2])] if self._walks else points
+        return points[points[:, 2] >= self.high[2] - 0.3 * np.ptp(points[:, 2])] if self._walks else points
 
     def _beside_head(self, direction: np.ndarray, name: str, about: str) -> Place:
         """Where a ray from that side meets the head, at the height of its eyes or through what is there."""
@@ -195,11 +195,11 @@ class ObjectPlaces:
         elif name in ("front", "rear", "back") and not self._walks:
             aim = np.array([np.median(points[:, 0]), middle[1], middle[2]])
         else:
-            aim = points[along > along.max() - 0.15 * reach].mean(axis=0)
+            aim = points[along >= along.max() - 0.15 * reach].mean(axis=0)
         start = aim + direction * (2 * self.longest_side)
         hit = self._hit(start, -direction)
         if hit is None:
-            near = points[along > along.max() - 0.15 * reach]
+            near = points[along >= along.max() - 0.15 * reach]
             hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
         if name == "bottom":
             hit = np.array([aim[0], self.low[1], aim[2]])
