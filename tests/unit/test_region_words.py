@@ -14,7 +14,8 @@ import fd_mitsuba as fd
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.load_scene import load_base, load_edit_scene
-from fd_mitsuba.scene.region_words import ObjectPlaces, region_size
+from fd_mitsuba.scene.region_size import region_size
+from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.tessellate import unit_sphere
 from fd_mitsuba.viewing.preview import preview_scene
 
@@ -99,6 +100,20 @@ def test_the_bottom_is_where_it_stands_and_the_belly_above(name: str) -> None:
     bottom, belly = (places.find(word).point for word in ("underside", "belly"))
     assert bottom[1] == places.low[1] and (np.abs(bottom - places.low - size / 2)[[0, 2]] < 0.25 * size[[0, 2]]).all()
     assert belly[1] >= bottom[1] and (belly[1] > bottom[1] + 0.2 * size[1]) == (name != "mug")
+
+
+def test_the_top_of_a_head_is_below_its_ears() -> None:
+    """An ear that leans back, in the middle as a comb, so that from above it is met first."""
+    vertices, faces = unit_sphere(3)
+    tilt = np.radians(25)
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    ear = (vertices * [0.05, 0.35, 0.09]) @ lean + np.array([0, 1.95, -0.05])
+    pieces = [vertices * [0.4, 0.6, 0.4] + [0, 0.6, 0], vertices * 0.3 + [0, 1.4, 0.1], ear]
+    rabbit = ObjectPlaces(np.concatenate(pieces), np.concatenate([faces + k * len(vertices) for k in range(3)]))
+    assert ear[:, 1].max() > 2.2
+    head = rabbit.find("head").point
+    assert 1.6 < head[1] < 1.8 and abs(head[0]) < 0.02 and -0.1 < head[2] < 0.2
+    assert 1.2 < rabbit.find("front of the head").point[1] < 1.6
 
 
 def test_arms_and_pots_have_no_eyes() -> None:

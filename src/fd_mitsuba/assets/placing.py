@@ -13,7 +13,8 @@ from fd_mitsuba.assets.region_xml import region_element
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.load_scene import load_base
 from fd_mitsuba.scene.plugins import DUAL_PATH
-from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion, region_size
+from fd_mitsuba.scene.region_size import region_size
+from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion
 
 
 def placed_regions(

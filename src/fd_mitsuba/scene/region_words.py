@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.body_outline import back_slice, eye_level
+from fd_mitsuba.scene.head_top import below_ears
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.picture_rays import pixel_ray
 
-DEFAULT_SIZE = 0.3
-"""Of a region, as a share of the object's longest side."""
 _REACH, _REACH_OF_FACE = 0.3, 1.0
 """Share of a region's half axis by which it reaches into the object, or out of it where it subtracts. What is worn on a
 face goes round it."""
@@ -90,6 +89,10 @@ class ObjectPlaces:
         """Of the bounding box."""
         return float((self.high - self.low).max())
 
+    @property
+    def _height(self) -> float:
+        return float(self.high[1] - self.low[1])
+
     def find(self, text: str) -> Place:
         """The place that the words of `--at` mean, the surface's nearest point to `x,y,z`, or what is seen at a pixel.
 
@@ -112,12 +115,12 @@ class ObjectPlaces:
         if of_head:
             side = {"back": "rear"}.get(side, side)
         if words == "head" or (of_head and side == "top"):
-            return self._side(_UP, "head", self._head_points(), "the top of its head")
+            return self._head
         if of_head and side in _DIRECTIONS:
             return self._beside_head(_DIRECTIONS[side], f"{side}_of_head".replace(" ", "_"), f"the {side} of its head")
         if words == "back":
             if self._walks:
-                across = back_slice(self._middle_points(), float(self.high[1] - self.low[1]))
+                across = back_slice(self._middle_points(), self._height)
                 return self._side(_UP, "back", across, "its back, seen from above")
             return self._side(-_FRONT, "back", self._points, "its back, away from where it looks")
         if words == "belly":
@@ -159,10 +162,15 @@ class ObjectPlaces:
         size = self.high - self.low
         return bool(size[2] > size[1])
 
+    @cached_property
+    def _head(self) -> Place:
+        seen = self._side(_UP, "head", self._head_points(), "the top of its head")
+        return replace(seen, point=below_ears(seen.point, self._hit, self.longest_side, self._height))
+
     def _head_points(self) -> np.ndarray:
         """The upper end of an upright object; of a long one the upper part of its front."""
         points = self._front_points()
-        return points[points[:, 1] >= points[:, 1].max() - 0.25 * (self.high[1] - self.low[1])]
+        return points[points[:, 1] >= points[:, 1].max() - 0.25 * self._height]
 
     def _front_points(self) -> np.ndarray:
         """Of a long object those of its front, of an upright one all."""
@@ -171,7 +179,7 @@ class ObjectPlaces:
 
     def _beside_head(self, direction: np.ndarray, name: str, about: str) -> Place:
         """Where a ray from that side meets the head, at the height of its eyes or through what is there."""
-        around = eye_level(self._front_points(), self.find("head").point[1], float(self.high[1] - self.low[1]))
+        around = eye_level(self._front_points(), self._head.point[1], self._height)
         middle = np.quantile(around, (0.02, 0.98), axis=0).mean(axis=0)
         hit = self._hit(middle + direction * (2 * self.longest_side), -direction)
         if hit is None:
@@ -247,39 +255,6 @@ class ObjectPlaces:
             t = np.einsum("ij,ij->i", c - a, turned) * inverse
             valid = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
         return origin + t[valid].min() * direction if valid.any() else None
-
-
-def region_size(text: str | None, longest_side: float) -> tuple[float, float, float]:
-    """Width, height and depth in the object's unit of what `--size` says.
-
-    Args:
-        text: a share of the longest side, as `0.3` or `30%`; three of them, with commas; `8u` is in the scene's unit.
-
-    Raises:
-        UserError: anything else, and sizes beyond 0.02 to 2 longest sides.
-    """
-    if text is None:
-        size = DEFAULT_SIZE * longest_side
-        return size, size, size
-    values = []
-    for word in text.split(","):
-        found = re.fullmatch(r"\s*([\d.]+(?:[eE][-+]?\d+)?)\s*(%|u)?\s*", word)
-        try:
-            number = float(found[1]) if found else 0.0
-        except ValueError:
-            number = 0.0
-        unit = found[2] if found else None
-        value = number if unit == "u" else number * longest_side / (100 if unit == "%" else 1)
-        if not 0.02 * longest_side <= value <= 2 * longest_side:
-            raise UserError(
-                f"--size {text}: give a share of the longest side from 0.02 to 2, such as 0.3 or 30%, or a length in "
-                f"the scene's unit, such as {0.3 * longest_side:.3g}u"
-            )
-        values.append(value)
-    if len(values) not in (1, 3):
-        raise UserError(f"--size {text}: give one size, or three: width, height, depth")
-    width, height, depth = values * 3 if len(values) == 1 else values
-    return width, height, depth
 
 
 def _upright(normal: np.ndarray) -> np.ndarray:
