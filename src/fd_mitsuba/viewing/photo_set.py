@@ -29,6 +29,8 @@ _BALANCE = 0.8
 """How much of the light's tint is taken out: with all of it, an evening would be noon; without, gold in blue light is
 green."""
 _LIT = 0.7
+_NEAR, _FAR = 2.0**-9, 2.0**14
+"""Canonical units."""
 _METERED_SIZE, _METERED_SAMPLES = 64, 1 << 19
 """The image that the exposure is found in has about so many pixels a side, and at least so many samples in all."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -148,7 +150,6 @@ class PhotoSet:
         """The first camera as Mitsuba's, with the box filter that a denoiser wants; `box` crops rows and columns."""
         mi = self.mi
         position, target = (self.frame.to_user(point[0]) for point in (camera.position, camera.target))
-        reach = float(np.linalg.norm(position - target))
         place = mi.ScalarTransform4f().look_at(
             origin=position.tolist(), target=target.tolist(), up=camera.basis()[1][0].tolist()
         )
@@ -167,8 +168,9 @@ class PhotoSet:
             {
                 "type": "perspective",
                 "fov": float(camera.fov_deg[0]),
-                "near_clip": 1e-3 * reach,
-                "far_clip": 1e4 * reach,
+                # Constants of a kernel, and so the same for all cameras: each other value takes seconds to compile.
+                "near_clip": _NEAR / self.frame.scale,
+                "far_clip": _FAR / self.frame.scale,
                 "to_world": place,
                 "film": film,
                 # Its pixels are as independent as a denoiser wants them, its samples of a pixel are spread.
