@@ -18,7 +18,8 @@ Hit = Callable[[np.ndarray, np.ndarray], np.ndarray | None]
 def below_ears(point: np.ndarray, hit: Hit, longest_side: float, height: float) -> np.ndarray:
     """(3,) the surface above the first place at or below `point` that is as thick as a head; `point` where none is.
 
-    Each step goes straight down and then to the middle of what is around it, so that it follows a slanting ear.
+    Each step goes straight down and then to the middle of what is around it, so that it follows an ear that leans. One
+    that slants more than it stands, cut level, is as thick as a head: there the place stays on it.
 
     Args:
         point: (3,) on the surface, seen from above, +y up.
