@@ -1,6 +1,6 @@
 """How often the benchmark's classifier finds the generator's own parts in the regions of `prior_pairs`.
 
-    python benchmarks/part_ceiling.py                               # two minutes of a core
+    python benchmarks/part_ceiling.py                               # half a minute of a core
     python benchmarks/part_ceiling.py --pairs teddy_backpack+backpack --seeds 3
 
 No run takes place. A part is made for a body of the generator, scaled until it fits the box of the case's regions,
