@@ -24,7 +24,7 @@ sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from prior_pairs import CASES, Case, regions_xml  # noqa: E402
+from prior_pairs import CASES, Case, chosen_cases, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
 from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, PartJudge, changed_pixels, load_judge  # noqa: E402
@@ -168,17 +168,13 @@ def main() -> int:
 
 
 def _measure(options: argparse.Namespace) -> int:
-    known = {case.name: case for case in CASES}
-    names = list(known) if options.pairs == "all" else [name.strip() for name in options.pairs.split(",")]
-    for name in names:
-        if name not in known:
-            raise UserError(f"--pairs {name}: no such pair; known: {', '.join(known)}")
+    cases = chosen_cases(options.pairs)
     judge = load_judge(options.classifier)
     torch.set_num_threads(1)
     results: dict[str, dict] = {}
     rows: dict[str, np.ndarray] = {}
-    for name in names:
-        case = known[name]
+    for case in cases:
+        name = case.name
         folder = options.output / name
         problem = None
         if not options.judge_only:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.data.captions import HELD_OUT, PART_WORDS
 from fd_mitsuba.scene.normalisation import Normalisation
 
@@ -88,6 +89,16 @@ CASES = (
     Case("rabbit_glasses", "rabbit", "cape", "rabbit", (Ellipsoid((0, -0.18, -0.42), (0.44, 0.56, 0.14), 28),)),
     Case("stump_butterfly", "stump", "butterfly", None),
 )
+
+
+def chosen_cases(names: str) -> list[Case]:
+    """All cases for "all", else those with the names, which commas part; UserError for one that is not there."""
+    known = {case.name: case for case in CASES}
+    wanted = list(known) if names == "all" else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise UserError(f"--pairs {name}: no such pair; known: {', '.join(known)}")
+    return [known[name] for name in wanted]
 
 
 def regions_xml(case: Case, frame: Normalisation) -> list[str]:

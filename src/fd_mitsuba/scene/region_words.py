@@ -123,6 +123,8 @@ class ObjectPlaces:
                 across = back_slice(self._middle_points(), self._height)
                 return self._side(_UP, "back", across, "its back, seen from above")
             return self._side(-_FRONT, "back", self._points, "its back, away from where it looks")
+        if words == "bottom":
+            return Place("bottom", self._between_feet(), -_UP.astype(np.float64), "its bottom")
         if words == "belly":
             return self._side(-_UP, "belly", self._points, "its belly, seen from below")
         if words in _DIRECTIONS:
@@ -187,6 +189,11 @@ class ObjectPlaces:
         reach = _REACH_OF_FACE if direction is _FRONT else _REACH
         return Place(name, hit, direction.astype(np.float64), about, reach)
 
+    def _between_feet(self) -> np.ndarray:
+        """The middle of what it stands on."""
+        feet = self._points[self._points[:, 1] <= self.low[1] + 0.15 * self._height]
+        return np.array([feet[:, 0].mean(), self.low[1], feet[:, 2].mean()])
+
     def _middle_points(self) -> np.ndarray:
         points, size = self._points, self.high - self.low
         middle = (self.low[2] + self.high[2]) / 2
@@ -194,7 +201,7 @@ class ObjectPlaces:
         return found if len(found) else points
 
     def _side(self, direction: np.ndarray, name: str, points: np.ndarray, about: str) -> Place:
-        """Where a ray from that side meets what is outermost there; at the bottom, where it stands."""
+        """Where a ray from that side meets what is outermost there."""
         along = points @ direction
         reach = max(float(np.ptp(along)), 1e-300)
         middle = (self.low + self.high) / 2
@@ -209,8 +216,6 @@ class ObjectPlaces:
         if hit is None:
             near = points[along >= along.max() - 0.15 * reach]
             hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
-        if name == "bottom":
-            hit = np.array([aim[0], self.low[1], aim[2]])
         return Place(name, hit, direction.astype(np.float64), about)
 
     def _point(self, text: str) -> Place:
