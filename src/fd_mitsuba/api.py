@@ -73,8 +73,9 @@ def import_asset(
         up: the asset's axis that points up, such as "z"; None: as the file says, or a guess.
         front: the axis that it looks along, such as "-y"; None: likewise.
         units: "mm", "cm" or "m"; None: as the format says.
-        at: places of focal regions; see `scene.region_words`; none: its head.
-        size: of the regions: a share of the longest side such as "0.3", or "12u" in the asset's unit.
+        at: places of focal regions; see `scene.region_words`; none: where the prompted part usually is, else its head.
+        size: of the regions: a share of the longest side such as "0.3", or "12u" in the asset's unit; None: what the
+            prompted part usually has there, see `scene.usual_regions`, else 0.3.
         light: an EXR environment map; None: a shipped one.
         subtract: whether the regions take something off, in place of adding a part.
 
@@ -85,17 +86,19 @@ def import_asset(
         UserError: an asset that cannot be read or edited, in one line with file, element and remedy.
 
     Example:
-        imported = fd.import_asset("duck.glb", "scenes/duck", prompt="a duck with a crown", at=["head"])
+        imported = fd.import_asset("duck.glb", "scenes/duck", prompt="a duck with a crown")
         run = fd.edit(fd.load_scene(imported.scene), output="runs/duck")
     """
     from fd_mitsuba.assets.importing import import_file
+    from fd_mitsuba.guidance.prompted_part import prompted_part
 
     for name, text in (("prompt", prompt), ("base_prompt", base_prompt)):
         if text is not None and not text.strip():
             raise UserError(f"{name}: is blank; describe the object")
     told = [None if text is None else " ".join(text.split()) for text in (prompt, base_prompt)]
     lit = _LIGHT if light is None else Path(light)
-    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size, subtract)
+    part = None if subtract else prompted_part(told[0], told[1] or "")
+    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size, subtract, part)
 
 
 def load_scene(

@@ -53,7 +53,7 @@ def load(tmp_path_factory: pytest.TempPathFactory) -> Load:
     def loaded(name: str) -> EditScene:
         if name not in scenes:
             folder = tmp_path_factory.mktemp("assets") / name
-            fd.import_asset(ASSETS / name, folder, prompt="a thing with a hat", up="y", front="z")
+            fd.import_asset(ASSETS / name, folder, prompt="a thing with a hat", at=["top"], up="y", front="z")
             scenes[name] = load_edit_scene(folder / "scene.xml")
         return scenes[name]
 

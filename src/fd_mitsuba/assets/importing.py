@@ -21,6 +21,7 @@ from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_stack import UNITS
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.scene.usual_regions import usual_place
 
 _MANY_SHAPES = 64
 
@@ -69,11 +70,13 @@ def import_file(
     at: Sequence[str] = (),
     size: str | None = None,
     subtract: bool = False,
+    part: str | None = None,
 ) -> ImportedAsset:
     """Write a scene to edit; see `api.import_asset`.
 
     Args:
         light: the EXR that lights it.
+        part: that the prompt asks for, as `guidance.prompted_part` names it.
 
     Raises:
         UserError: an asset that cannot be read or edited, options that are wrong, a folder with something in it.
@@ -93,7 +96,7 @@ def import_file(
     orientation = find_orientation(vertices, faces, suffix, (asset.up, asset.front), (wanted[0], wanted[1]))
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
-    regions, about = placed_regions(places, at or ("head",), size, subtract)
+    regions, about = placed_regions(places, at or (usual_place(part),), size, subtract, part)
     words = _words(path)
     text = SceneText(
         prompt=prompt or words,
@@ -107,7 +110,8 @@ def import_file(
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
     if not at:
-        remarks.append("puts the region on its head; --at says otherwise: top, back, 'left side', x,y,z and the like")
+        where = "on its head" if usual_place(part) == "head" else f"at {places.find(usual_place(part)).about}"
+        remarks.append(f"puts the region {where}; --at says otherwise: top, back, 'left side', x,y,z and the like")
     if prompt is None:
         remarks.append(f"calls it {text.prompt!r}; give the prompt of a run with --prompt")
     return ImportedAsset(

@@ -15,15 +15,19 @@ from fd_mitsuba.scene.load_scene import load_base
 from fd_mitsuba.scene.plugins import DUAL_PATH
 from fd_mitsuba.scene.region_size import region_size
 from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion
+from fd_mitsuba.scene.usual_regions import region_for, usual_region
 
 
 def placed_regions(
-    places: ObjectPlaces, at: Sequence[str], size: str | None, subtract: bool = False
+    places: ObjectPlaces, at: Sequence[str], size: str | None, subtract: bool = False, part: str | None = None
 ) -> tuple[list[PlacedRegion], list[str]]:
     """A region for each place, named apart, and a sentence about each.
 
     Args:
+        at: as the words of `--at`.
+        size: of all; None: what the part usually has at such a place, else a share of the object.
         subtract: whether what they hold is cut out of the base.
+        part: what is to grow there, a name of `scene.usual_regions`; None: who knows.
 
     Raises:
         UserError: a place or a size that is not known.
@@ -31,12 +35,19 @@ def placed_regions(
     extent = region_size(size, places.longest_side)
     found = [places.find(word) for word in at]
     count = Counter(place.name for place in found)
-    regions = [
-        places.region(place, extent, f"{place.name}_{number}" if count[place.name] > 1 else place.name, subtract)
-        for number, place in enumerate(found, 1)
-    ]
-    shown = " x ".join(f"{value:.3g}" for value in extent) + (", subtracts" if subtract else "")
-    return regions, [f"{region.name}: {place.about}, {shown}" for place, region in zip(found, regions, strict=True)]
+    regions, about = [], []
+    for number, place in enumerate(found, 1):
+        name = f"{place.name}_{number}" if count[place.name] > 1 else place.name
+        usual = usual_region(part, place) if size is None and not subtract else None
+        if usual is None:
+            region = places.region(place, extent, name, subtract)
+        else:
+            region = region_for(usual, places, place, name)
+        shown = " x ".join(f"{value:.3g}" for value in 2 * region.half_axes)
+        why = ", subtracts" if subtract else f", the usual size for {part}" if usual else ""
+        regions.append(region)
+        about.append(f"{name}: {place.about}, {shown}{why}")
+    return regions, about
 
 
 def write_placed_regions(
@@ -46,8 +57,12 @@ def write_placed_regions(
     size: str | None,
     target: Path,
     subtract: bool = False,
+    part: str | None = None,
 ) -> list[str]:
     """Write regions at places of a scene's base to `target`, an XML file for `--regions`; a sentence about each.
+
+    Args:
+        at, size, subtract, part: as in `placed_regions`.
 
     Raises:
         UserError: a scene that cannot be read, a place or a size that is not known.
@@ -56,7 +71,7 @@ def write_placed_regions(
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in base[:-1]])
     vertices = np.concatenate([mesh.vertices for mesh in base])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(base, starts, strict=True)])
-    regions, about = placed_regions(ObjectPlaces(vertices, faces), at, size, subtract)
+    regions, about = placed_regions(ObjectPlaces(vertices, faces), at, size, subtract, part)
     root = ElementTree.Element("scene", version="3.0.0")
     integrator = ElementTree.SubElement(root, "integrator", type=DUAL_PATH)
     ElementTree.SubElement(integrator, "boolean", name="only_these_regions", value="true")

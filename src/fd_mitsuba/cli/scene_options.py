@@ -44,10 +44,12 @@ def placing_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="PLACE",
         help="where a region goes: top, head, back, front, rear, 'left side', 'right side', bottom, 'front of the "
-        "head', or x,y,z; may be given several times",
+        "head', or x,y,z; may be given several times; default for a mesh file: where the prompted part usually is",
     )
     parser.add_argument(
-        "--size", metavar="SIZE", help="of these regions: a share of the longest side such as 0.3 or 30%%, or 12u"
+        "--size",
+        metavar="SIZE",
+        help="of these regions: a share of the longest side such as 0.3 or 30%%, or 12u; default: as such parts are",
     )
     parser.add_argument(
         "--subtract", action="store_true", help="these regions take something off, in place of adding a part"

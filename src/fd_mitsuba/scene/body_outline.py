@@ -17,6 +17,8 @@ _NECK, _SHOULDERS, _WIDE = 0.85, 1.5, 0.95
 is at least so wide."""
 _FIRST_SLICES = 4
 """A head grows quickly wider at its top; nothing there is a shoulder."""
+_EYES_BELOW = 0.3
+"""The top, as a share of the width there: of a ball this is 0.53 of its radius."""
 _BACK_SLICES, _LEVEL = 9, 0.1
 """Into which the middle of an animal is cut, and how much of its height a back may rise above its lowest slice."""
 
@@ -56,6 +58,28 @@ def eye_level(points: Float[np.ndarray, "N 3"], top: float, height: float) -> Fl
         slices, widths = slices[: _SLICES // 4], widths[: _SLICES // 4]
     wide = [found for found, width in zip(slices, widths, strict=True) if len(found) and width >= _WIDE * max(widths)]
     return wide[len(wide) // 3] if wide else below
+
+
+def animal_eye_level(points: Float[np.ndarray, "N 3"], top: float, height: float) -> Float[np.ndarray, "M 3"]:
+    """(M, 3) those of the points around an animal's head at the height of its eyes; at least one.
+
+    Its muzzle is below them and its chest behind, so that no outline tells; but they are as far below the top as in a
+    ball, half of the radius.
+
+    Args:
+        points, top, height: as in `eye_level`.
+
+    >>> ball = np.random.default_rng(0).normal(size=(4000, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> bool(np.abs(animal_eye_level(ball, 1.0, 6.0)[:, 1].mean() - 0.47) < 0.12)
+    True
+    """
+    step = height / _SLICES
+    for number in range(1, _SLICES // 2):
+        found = points[np.abs(points[:, 1] - top + number * step) <= step]
+        if len(found) and number * step >= _EYES_BELOW * np.ptp(np.quantile(found[:, 0], (0.02, 0.98))):
+            return found
+    return eye_level(points, top, height)
 
 
 def back_slice(points: Float[np.ndarray, "N 3"], height: float) -> Float[np.ndarray, "M 3"]:

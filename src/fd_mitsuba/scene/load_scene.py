@@ -136,6 +136,16 @@ def load_base(path: Path | str, parameters: Mapping[str, str] | None = None) -> 
     return base
 
 
+def scene_prompt(path: Path | str, parameters: Mapping[str, str] | None = None) -> str | None:
+    """The prompt that a scene gives itself; None: none.
+
+    Raises:
+        UserError: a scene that cannot be read.
+    """
+    inputs = EditInputs(SceneFile(Path(path), dict(parameters or {})))
+    return inputs.prompts(None, "")[0] if inputs.has_prompt else None
+
+
 def _without_base(file: SceneFile) -> UserError:
     return UserError(f'{file.path}: no base shape; add the object to edit, such as <shape type="ply" id="base">')
 

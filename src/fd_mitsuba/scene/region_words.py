@@ -9,14 +9,19 @@ from functools import cached_property
 import numpy as np
 
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.scene.body_outline import back_slice, eye_level
+from fd_mitsuba.scene.body_outline import animal_eye_level, back_slice, eye_level
 from fd_mitsuba.scene.head_top import below_ears
 from fd_mitsuba.scene.mesh_distance import MeshDistance
 from fd_mitsuba.scene.picture_rays import pixel_ray
+from fd_mitsuba.scene.triangle_rays import TriangleRays
 
 _REACH, _REACH_OF_FACE = 0.3, 1.0
 """Share of a region's half axis by which it reaches into the object, or out of it where it subtracts. What is worn on a
 face goes round it."""
+_HEAD_WIDTHS = 0.17, 0.44
+"""Least and largest width of a head, as shares of the longest side: what is put on a mug is no wider."""
+_FEET_APART = 0.4
+"""Least length of what an animal on four legs stands on, as a share of its height."""
 _SAMPLES = 20_000
 _UP, _FRONT, _LEFT = np.eye(3)[1], np.eye(3)[2], np.eye(3)[0]
 _DIRECTIONS = {
@@ -89,6 +94,13 @@ class ObjectPlaces:
         """Of the bounding box."""
         return float((self.high - self.low).max())
 
+    @cached_property
+    def head_width(self) -> float:
+        """At the height of its eyes; within what a head can have of the longest side."""
+        around = self._eye_level()
+        width = float(np.ptp(np.quantile(around[:, 0], (0.02, 0.98))))
+        return float(np.clip(width, *(share * self.longest_side for share in _HEAD_WIDTHS)))
+
     @property
     def _height(self) -> float:
         return float(self.high[1] - self.low[1])
@@ -139,15 +151,18 @@ class ObjectPlaces:
         Args:
             size: its width, or width, height and depth, in the object's unit: height is along the place's normal.
         """
-        extent = np.broadcast_to(np.asarray(size, dtype=np.float64), (3,))
-        half = extent / 2
+        half = np.broadcast_to(np.asarray(size, dtype=np.float64), (3,)) / 2
         outwards = (_REACH - 1 if subtracts else 1 - place.reach) * half[1]
         centre = place.point + outwards * place.normal
-        return PlacedRegion(name or place.name, centre, half, _upright(place.normal), subtracts)
+        return PlacedRegion(name or place.name, centre, half, upright(place.normal), subtracts)
 
     @cached_property
     def _corners(self) -> np.ndarray:
         return self.vertices[self.faces]
+
+    @cached_property
+    def _rays(self) -> TriangleRays:
+        return TriangleRays(self._corners)
 
     @cached_property
     def _points(self) -> np.ndarray:
@@ -160,14 +175,14 @@ class ObjectPlaces:
 
     @cached_property
     def _walks(self) -> bool:
-        """Whether it is longer than it is high, as animals on four legs are."""
-        size = self.high - self.low
-        return bool(size[2] > size[1])
+        """Whether it is longer than it is high, or stands on feet far behind each other, as animals on four legs do."""
+        size, feet = self.high - self.low, np.ptp(self._feet, axis=0)
+        return bool(size[2] > size[1] or (feet[2] > _FEET_APART * size[1] and feet[2] > 2 * feet[0]))
 
     @cached_property
     def _head(self) -> Place:
         seen = self._side(_UP, "head", self._head_points(), "the top of its head")
-        return replace(seen, point=below_ears(seen.point, self._hit, self.longest_side, self._height))
+        return replace(seen, point=below_ears(seen.point, self._rays.way_out, self.longest_side, self._height))
 
     def _head_points(self) -> np.ndarray:
         """The upper end of an upright object; of a long one the upper part of its front."""
@@ -179,19 +194,28 @@ class ObjectPlaces:
         points = self._points
         return points[points[:, 2] >= self.high[2] - 0.3 * np.ptp(points[:, 2])] if self._walks else points
 
+    def _eye_level(self) -> np.ndarray:
+        """Points around its head at the height of its eyes."""
+        level = animal_eye_level if self._walks else eye_level
+        return level(self._front_points(), self._head.point[1], self._height)
+
     def _beside_head(self, direction: np.ndarray, name: str, about: str) -> Place:
         """Where a ray from that side meets the head, at the height of its eyes or through what is there."""
-        around = eye_level(self._front_points(), self._head.point[1], self._height)
+        around = self._eye_level()
         middle = np.quantile(around, (0.02, 0.98), axis=0).mean(axis=0)
-        hit = self._hit(middle + direction * (2 * self.longest_side), -direction)
+        hit = self._rays.first(middle + direction * (2 * self.longest_side), -direction)
         if hit is None:
             hit = around[np.argmax(around @ direction)]
         reach = _REACH_OF_FACE if direction is _FRONT else _REACH
         return Place(name, hit, direction.astype(np.float64), about, reach)
 
+    @cached_property
+    def _feet(self) -> np.ndarray:
+        return self._points[self._points[:, 1] <= self.low[1] + 0.15 * self._height]
+
     def _between_feet(self) -> np.ndarray:
         """The middle of what it stands on."""
-        feet = self._points[self._points[:, 1] <= self.low[1] + 0.15 * self._height]
+        feet = self._feet
         return np.array([feet[:, 0].mean(), self.low[1], feet[:, 2].mean()])
 
     def _middle_points(self) -> np.ndarray:
@@ -212,7 +236,7 @@ class ObjectPlaces:
         else:
             aim = points[along >= along.max() - 0.15 * reach].mean(axis=0)
         start = aim + direction * (2 * self.longest_side)
-        hit = self._hit(start, -direction)
+        hit = self._rays.first(start, -direction)
         if hit is None:
             near = points[along >= along.max() - 0.15 * reach]
             hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
@@ -230,7 +254,7 @@ class ObjectPlaces:
         return Place("point", hit, self._outward(hit), f"the nearest point of its surface, ({shown})")
 
     def _seen(self, text: str, origin: np.ndarray, direction: np.ndarray) -> Place:
-        hit = self._hit(origin, direction)
+        hit = self._rays.first(origin, direction)
         if hit is None:
             raise UserError(f"--at {text}: nothing of the object is seen at that pixel; take one of the object itself")
         shown = ", ".join(f"{value:.4g}" for value in hit)
@@ -246,23 +270,8 @@ class ObjectPlaces:
         length = np.linalg.norm(normal)
         return normal / length if length > 0 else _UP.astype(np.float64)
 
-    def _hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """The first point of the surface along a ray."""
-        a, b, c = self._corners.transpose(1, 0, 2)
-        across = np.cross(direction, c - a)
-        determinant = np.einsum("ij,ij->i", b - a, across)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1.0 / determinant
-            offset = origin - a
-            u = np.einsum("ij,ij->i", offset, across) * inverse
-            turned = np.cross(offset, b - a)
-            v = turned @ direction * inverse
-            t = np.einsum("ij,ij->i", c - a, turned) * inverse
-            valid = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
-        return origin + t[valid].min() * direction if valid.any() else None
 
-
-def _upright(normal: np.ndarray) -> np.ndarray:
+def upright(normal: np.ndarray) -> np.ndarray:
     """(3, 3) rotation that takes +y to `normal`, and turns no more than that needs."""
     if normal[1] > 1 - 1e-9:
         return np.eye(3)

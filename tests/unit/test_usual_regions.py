@@ -1,0 +1,96 @@
+"""Regions that fit what the prompt asks for, where nobody says how large they are or where they go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fd_mitsuba as fd
+from fd_mitsuba.assets.placing import placed_regions
+from fd_mitsuba.cli.main import main
+from fd_mitsuba.guidance.builtin import FINE_FOLDER
+from fd_mitsuba.guidance.model_conventions import read_model_conventions
+from fd_mitsuba.guidance.prompted_part import prompted_part
+from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.scene.region_words import ObjectPlaces
+from fd_mitsuba.scene.usual_regions import USUAL_REGIONS, usual_place
+
+ASSETS = Path(__file__).parents[1] / "data" / "assets"
+SCENES = Path(__file__).parents[2] / "scenes"
+ON_BODIES = {
+    "glasses": "cat", "skateboard": "dog", "cape": "person", "wings": "cow", "crown": "bear", "pointed hat": "snowman",
+    "backpack": "person", "antlers": "duck", "handle": "vase", "butterfly": "pig", "flower": "robot",
+}  # fmt: skip
+
+
+def _inside(points: np.ndarray, part: str, places: ObjectPlaces) -> float:
+    (region,), _ = placed_regions(places, [usual_place(part)], None, part=part)
+    to_unit = np.linalg.inv(region.to_world())
+    return float((np.linalg.norm(points @ to_unit[:3, :3].T + to_unit[:3, 3], axis=1) < 1).mean())
+
+
+@pytest.mark.parametrize("part", ON_BODIES)
+def test_a_region_holds_most_of_such_a_part(part: str) -> None:
+    """Parts of the coarse makers, whose sizes are not in the table."""
+    body = BODIES[ON_BODIES[part]](np.random.default_rng(11))
+    places = ObjectPlaces(body.solid.vertices, body.solid.faces)
+    points = PARTS[part](body, np.random.default_rng(12)).vertices
+    assert _inside(points, part, places) > 0.5  # antlers: their tips are in an ellipsoid's corners
+    (region,), _ = placed_regions(places, [usual_place(part)], None, part=part)
+    # And is no waste: twice the part's box at most, but for what is very thin.
+    assert (2 * region.half_axes).max() < 2.2 * np.ptp(points, axis=0).max()
+
+
+def test_all_parts_of_the_priors_have_one() -> None:
+    vocabulary = read_model_conventions(FINE_FOLDER).vocabulary
+    assert vocabulary is not None and set(USUAL_REGIONS) == set(vocabulary.parts)
+
+
+def test_sizes_and_places_that_are_said_count() -> None:
+    body = BODIES["bear"](np.random.default_rng(0))
+    places = ObjectPlaces(body.solid.vertices, body.solid.faces)
+    (said,), about = placed_regions(places, ["head"], "0.2", part="crown")
+    assert np.allclose(2 * said.half_axes, 0.2 * places.longest_side) and "usual" not in about[0]
+    (elsewhere,), _ = placed_regions(places, ["left side"], None, part="skateboard")
+    assert np.allclose(2 * elsewhere.half_axes, 0.3 * places.longest_side)  # nothing is usual there
+    (hat,), about = placed_regions(places, ["left side"], None, part="crown")
+    assert hat.half_axes[0] > 1.5 * hat.half_axes[1] and "the usual size for crown" in about[0]
+    (hole,), _ = placed_regions(places, ["head"], None, subtract=True, part="crown")
+    assert hole.subtracts and np.allclose(2 * hole.half_axes, 0.3 * places.longest_side)
+
+
+def test_a_mesh_needs_nothing_but_a_prompt(tmp_path: Path) -> None:
+    made = fd.import_asset(ASSETS / "duck.stl", tmp_path / "duck", prompt="a duck on a skateboard")
+    assert made.regions[0].startswith("bottom: ") and made.regions[0].endswith("the usual size for skateboard")
+    assert any("puts the region at its bottom" in line for line in made.remarks)
+    scene = fd.load_scene(made.scene)
+    assert scene.regions[0].name == "bottom"
+    plain = fd.import_asset(ASSETS / "duck.stl", tmp_path / "plain", prompt="a duck with a spaceship")
+    assert plain.regions[0].startswith("head: ") and "usual" not in plain.regions[0]
+
+
+def test_a_scene_says_its_prompt_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = SCENES / "cat" / "scene.xml"
+    assert main(["check", str(scene), "--at", "head"]) == 0
+    assert "the usual size for crown" in capsys.readouterr().err
+    assert main(["check", str(scene), "--at", "head", "--prompt", "a cat with a butterfly"]) == 0
+    assert "the usual size for butterfly" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("prompt", "part"),
+    [
+        ("a duck with a crown", "crown"),
+        ("Sunglasses on a man", "glasses"),
+        ("a horse with wings and a horn", None),
+        ("a mug without a handle", None),
+        ("a spaceship", None),
+        ("", None),
+        (None, None),
+    ],
+)
+def test_the_one_part_of_a_prompt(prompt: str | None, part: str | None) -> None:
+    assert prompted_part(prompt) == part
