@@ -2,6 +2,8 @@
 
     python benchmarks/prior_in_3d.py                              # 24 runs, about 90 s each on a quiet core
     python benchmarks/prior_in_3d.py --pairs cat+crown,mug+handle # some of them
+    python benchmarks/prior_in_3d.py --pairs new --set guidance.model=builtin-fine \
+        --classifier src/fd_mitsuba/weights/part_judge            # 16 runs with words that only the finer prior knows
     python benchmarks/prior_in_3d.py --judge-only                 # judge the runs that are there once more
 
 Each case of `prior_pairs` is a geometry run in a process of its own. Eight ring views of the finished object, and of
@@ -24,26 +26,36 @@ sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "src")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+import trimesh  # noqa: E402
 from prior_pairs import CASES, Case, chosen_cases, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
 from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, PartJudge, changed_pixels, load_judge  # noqa: E402
 from fd_mitsuba.evaluation.verdict import judged_views  # noqa: E402
 from fd_mitsuba.io.json_object import write_json  # noqa: E402
+from fd_mitsuba.prior.data.fine.bodies import BODIES  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
+from fd_mitsuba.scene.usual_regions import usual_place  # noqa: E402
 from fd_mitsuba.viewing.turntable import render_ring, write_sheet  # noqa: E402
 
 VIEWS, SHEET_SIZE = 8, 112
 ELEVATION_DEG, HALF_WIDTH = 15.0, 1.25
 """In the middle of what the classifier was trained on: elevations of -10 to 45 degrees, half widths of 1.05 to 1.5."""
+MADE_SEED = 1000
 LEAST_FOUND, MOST_AT_START = 0.80, 0.20
 Mesh = tuple[torch.Tensor, torch.Tensor]
 
 
 def write_scene(case: Case, folder: Path) -> Path:
-    """The scene file of a case: the shipped one, or a copy with the case's ellipsoids in place of its regions."""
+    """What a case starts from: the shipped scene, a copy with the case's ellipsoids, or the mesh of a made body."""
+    if not case.scene:
+        path = folder / "scenes" / f"{case.body}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        solid = BODIES[case.body](np.random.default_rng(MADE_SEED)).solid
+        trimesh.Trimesh(solid.vertices, solid.faces, process=False).export(path)
+        return path
     shipped = ROOT / "scenes" / case.scene / "scene.xml"
     if not case.ellipsoids:
         return shipped
@@ -72,6 +84,9 @@ def grow(case: Case, folder: Path, config: Path, settings: list[str], cores: str
         return None
     command = [sys.executable, "-m", "fd_mitsuba", "run", str(write_scene(case, folder)), "--prompt", case.prompt]
     command += ["-c", str(config), "-o", str(run), "--stage", "geometry", "-q"]
+    if case.by_words:
+        command += ["--at", usual_place(case.part)]
+        command += [] if case.scene else ["--up", "y", "--front", "z"]
     command += [argument for setting in settings for argument in ("--set", setting)]
     command += ["--resume"] if (run / "run.json").is_file() else []
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
@@ -153,7 +168,7 @@ def summary(results: dict[str, dict]) -> dict:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "prior_in_3d", metavar="FOLDER")
-    parser.add_argument("--pairs", default="all", help=f"all, or some of {', '.join(case.name for case in CASES)}")
+    parser.add_argument("--pairs", default="all", help=f"all, new, or some of {', '.join(case.name for case in CASES)}")
     parser.add_argument("--config", type=Path, default=ROOT / "configs" / "quick.toml")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--cores", default="", metavar="LIST", help="pin the runs to these cores, as taskset has them")
