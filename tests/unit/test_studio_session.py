@@ -23,6 +23,7 @@ from fd_mitsuba.studio.run_state import QUEUED
 from fd_mitsuba.studio.session import Session
 from fd_mitsuba.studio.settings import StudioSettings
 
+ASSETS = Path(__file__).parents[1] / "data" / "assets"
 NOTHING = (sys.executable, "-I", "-c", "")
 SMOKE = StudioSettings("smoke")
 
@@ -73,6 +74,28 @@ def test_what_a_person_does_is_heard_and_kept(session: Session, scene: Path, tmp
     assert again.state.regions.poses == session.state.regions.poses and again.state.prompt == "a pig with a hat"
     assert (again.state.settings, again.state.selected) == (session.state.settings, image)
     again.close()
+
+
+@pytest.mark.parametrize("name", ["duck.stl", "box.glb"])
+def test_an_untouched_region_of_an_opened_mesh_follows_the_prompt(session: Session, name: str) -> None:
+    session.open_mesh(ASSETS / name)
+    (on_head,) = session.state.regions.poses.values()
+    topics: list[str] = []
+    session.subscribe(topics.append)
+    session.edits.set_prompt("a duck on a skateboard")
+    (below,) = session.state.regions.poses.values()
+    assert topics == ["pose", "prompt"] and below.centre[1] < on_head.centre[1]
+    assert max(below.radii) > 2 * min(below.radii)
+    session.edits.set_prompt("a duck with a spaceship")
+    (back,) = session.state.regions.poses.values()
+    assert back.lies_on(on_head)
+    session.edits.undo()  # what was typed without a break is one change
+    assert list(session.state.regions.poses.values()) == [on_head]
+    x, y, z = on_head.radii
+    session.edits.put(replace(on_head, radii=(1.1 * x, y, z)))
+    (mine,) = session.state.regions.poses.values()
+    session.edits.set_prompt("a duck with a crown")  # a region that was touched stays
+    assert list(session.state.regions.poses.values()) == [mine]
 
 
 def test_a_click_puts_a_region_on_the_base(session: Session) -> None:

@@ -10,12 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from fd_mitsuba.assets.placing import placed_regions
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.guidance.prompted_part import prompted_part
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import ADD
 from fd_mitsuba.scene.headroom import frame_with_headroom
 from fd_mitsuba.scene.load_scene import load_edit_scene
+from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
+from fd_mitsuba.scene.usual_regions import usual_place
 from fd_mitsuba.studio.base_glb import base_glb
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.opening import Opened
@@ -78,6 +83,30 @@ class EditState:
         change = frame.matrix() @ np.linalg.inv(paper.matrix())
         seen = regions if frame is paper else tuple(region.seen_from(change) for region in regions)
         return replace(self.scene, regions=seen, frame=frame, prompt=self.prompt)
+
+    def follow_prompt(self, before: str) -> bool:
+        """Put the region where the prompt's part usually is, if it is where that of the prompt `before` usually is: as
+        an import puts it, and untouched. Whether it has moved.
+        """
+        poses = list(self.regions.poses.values())
+        if len(poses) != 1 or self.regions.meshes or poses[0].mode != ADD:
+            return False
+        usual = self._usual_pose(poses[0], before)
+        if not poses[0].lies_on(usual):
+            return False
+        self.regions.put(self._usual_pose(poses[0], self.prompt))
+        return not self.regions.pose(poses[0].name).lies_on(usual)
+
+    def _usual_pose(self, pose: EllipsoidPose, prompt: str) -> EllipsoidPose:
+        part = prompted_part(prompt)
+        (region,), _ = placed_regions(self._places, [usual_place(part)], None, part=part)
+        place = EllipsoidPose.of_matrix(pose.name, region.to_world())
+        return replace(pose, centre=place.centre, wxyz=place.wxyz, radii=place.radii)
+
+    @cached_property
+    def _places(self) -> ObjectPlaces:
+        soup = self.scene.base_soup
+        return ObjectPlaces(soup.vertices, soup.faces)
 
     @cached_property
     def base(self) -> TriangleMesh:

@@ -114,7 +114,10 @@ class Edits:
         self._tell("regions", check=True)
 
     def set_prompt(self, prompt: str) -> None:
-        """The sentence for the next run; blank: none can be started. UserError where it is far too long."""
+        """The sentence for the next run; blank: none can be started. UserError where it is far too long.
+
+        A region that is as an import has put it, and nobody has touched, follows: see `EditState.follow_prompt`.
+        """
         words = one_line_of(prompt)
         if fault := length_fault(words):
             raise UserError(f"the prompt {fault}")
@@ -122,7 +125,10 @@ class Edits:
             if words == self._state.prompt:
                 return
             self._history.before("prompt", self._snapshot())
-            self._state.prompt = words
+            before, self._state.prompt = self._state.prompt, words
+            moved = self._state.follow_prompt(before)
+        if moved:
+            self._tell("pose")
         self._tell("prompt", check=True)
 
     def set_settings(self, **changed: Any) -> None:
