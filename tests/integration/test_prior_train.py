@@ -115,8 +115,14 @@ def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named() -> None:
-    assert {kind_named(name).name for name in KINDS} == {"geometry", "geometry_fine", "appearance", "appearance_fine"}
-    with pytest.raises(UserError, match="known: geometry, geometry_fine, appearance, appearance_fine"):
+    assert {kind_named(name).name for name in KINDS} == {
+        "geometry",
+        "geometry_wide",
+        "geometry_fine",
+        "appearance",
+        "appearance_fine",
+    }
+    with pytest.raises(UserError, match="known: geometry, geometry_wide, geometry_fine, appearance, appearance_fine"):
         kind_named("smell")
 
 

@@ -14,9 +14,9 @@ def add_training(actions: argparse._SubParsersAction) -> None:
     train.add_argument(
         "--kind",
         default="geometry",
-        help="geometry (normals), appearance (colours), geometry_fine or appearance_fine (at 64 pixels a view), "
-        "evaluator (the metrics' CLIP), part_judge (gives a run its verdict) or part_judge_coarse (that of the "
-        "benchmarks)",
+        help="geometry (normals), geometry_wide (of 32 parts), appearance (colours), geometry_fine or appearance_fine "
+        "(at 64 pixels a view), evaluator (the metrics' CLIP), part_judge (gives a run its verdict) or "
+        "part_judge_coarse (that of the benchmarks)",
     )
     train.add_argument("-o", "--output", default="runs/prior", metavar="FOLDER", help="checkpoint and log")
     train.add_argument("--steps", type=int, help="length of the schedule; default: what the kind takes to be good")

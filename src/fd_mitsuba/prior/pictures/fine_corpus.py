@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +14,10 @@ from fd_mitsuba.prior.data.fine.captions import caption
 from fd_mitsuba.prior.data.fine.parts import PARTS
 from fd_mitsuba.prior.data.fine.placement import varied
 from fd_mitsuba.prior.data.fine.surface import Surface
-from fd_mitsuba.prior.data.primitives import join, transform
+from fd_mitsuba.prior.data.parts import PARTS as PLAIN_PARTS
+from fd_mitsuba.prior.data.parts import resized
+from fd_mitsuba.prior.data.primitives import Solid, join, transform
+from fd_mitsuba.prior.pictures.corpus import VIEW_SIZE as PLAIN_VIEW_SIZE
 from fd_mitsuba.prior.pictures.corpus import (
     MosaicCamera,
     Pair,
@@ -32,6 +36,7 @@ REMOVED_SHARE = 0.1
 BESIDE_SHARE = 0.12
 """Pairs whose body wears another part, before and after."""
 Hits = tuple[np.ndarray, np.ndarray]
+Grow = Callable[[str, Surface, np.random.Generator], Solid | None]
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,8 @@ class FinePair(Pair):
     beside: str | None = field(default=None, kw_only=True)
 
     def shows_part(self) -> bool:
-        return bool(self.changed().sum() >= LEAST_PIXELS)
+        least = LEAST_PIXELS * (self.edited.shape[-1] / (2 * VIEW_SIZE)) ** 2
+        return bool(self.changed().sum() >= least)
 
 
 def stretched(body: Body, factors: np.ndarray) -> Body:
@@ -73,12 +79,37 @@ def nearer(first: Hits, second: Hits) -> Hits:
     return np.where(closer, second[0], first[0]), np.where(closer[:, None], second[1], first[1])
 
 
-def make_fine_pairs(body: str, parts: list[str | None], seed: int) -> list[FinePair]:
-    """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
+def grow_fine(part: str, surface: Surface, rng: np.random.Generator) -> Solid | None:
+    """A part with detail, placed and sized with variety; None where its maker finds no place."""
+    zones = PARTS[part](surface, rng)
+    return varied(part, join(list(zones.values())), surface, rng) if zones else None
+
+
+def grow_wide(part: str, surface: Surface, rng: np.random.Generator) -> Solid | None:
+    """In half of the cases a part that the coarse makers know as they make it: plainer, for views of few pixels."""
+    if part not in PLAIN_PARTS or rng.random() < 0.5:
+        return grow_fine(part, surface, rng)
+    return resized(part, PLAIN_PARTS[part](surface.body, rng), surface.body, rng)
+
+
+def make_wide_pairs(body: str, parts: list[str | None], seed: int) -> list[FinePair]:
+    """All bodies and parts in views of 32 pixels."""
+    return make_fine_pairs(body, parts, seed, PLAIN_VIEW_SIZE, grow_wide)
+
+
+def make_fine_pairs(
+    body: str, parts: list[str | None], seed: int, view_size: int = VIEW_SIZE, grow: Grow = grow_fine
+) -> list[FinePair]:
+    """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed).
+
+    Args:
+        view_size: pixels of a view's side.
+        grow: (part, surface, rng) -> that part's solid; None: it does not fit there.
+    """
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
     surface = Surface(stretched(BODIES[body](rng), np.diag(random_stretch(rng))))
     overview = global_camera(rng)
-    overview_rays = overview.rays(VIEW_SIZE)
+    overview_rays = overview.rays(view_size)
     overview_hits = surface.caster.cast(*overview_rays[:2])
     pairs: list[FinePair] = []
     before: tuple[str, RayCaster] | None = None
@@ -92,23 +123,21 @@ def make_fine_pairs(body: str, parts: list[str | None], seed: int) -> list[FineP
         edited = base if own is None else nearer(base, own.cast(*rays[:2]))
         removed = part is not None and rng.random() < REMOVED_SHARE
         words = f"{caption(body, part, rng, removed)}, {view_words(camera.azimuth_deg, closeup)}"
-        first, second = (shade(*hits, rays[2], VIEW_SIZE) for hits in (base, edited))
+        first, second = (shade(*hits, rays[2], view_size) for hits in (base, edited))
         if removed:
             first, second = second, first
         view = camera.azimuth_deg, closeup
         pairs.append(FinePair(first, second, words, body, part, *view, removed=removed, beside=beside))
 
     for part in parts:
-        zones = {} if part is None else PARTS[part](surface, rng)
-        if not zones:
+        solid = None if part is None else grow(part, surface, rng)
+        if part is None or solid is None:
             add(overview, overview_rays, overview_hits, None, None, False)
             continue
-        assert part is not None
-        solid = varied(part, join(list(zones.values())), surface, rng)
         own = RayCaster(solid)
         add(overview, overview_rays, overview_hits, own, part, False)
         near = closeup_camera(solid, rng)
-        rays = near.rays(VIEW_SIZE)
+        rays = near.rays(view_size)
         add(near, rays, surface.caster.cast(*rays[:2]), own, part, True)
         before = part, own
     return pairs

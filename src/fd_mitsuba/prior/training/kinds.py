@@ -18,7 +18,7 @@ from fd_mitsuba.prior.data.catalogue import COARSE, FINE, Catalogue
 from fd_mitsuba.prior.pictures.colour_corpus import make_colour_pairs
 from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
 from fd_mitsuba.prior.pictures.fine_colour_corpus import make_fine_colour_pairs
-from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs
+from fd_mitsuba.prior.pictures.fine_corpus import make_fine_pairs, make_wide_pairs
 from fd_mitsuba.prior.training.model import build_text_encoder, build_unet
 from fd_mitsuba.prior.training.vae import build_vae
 from fd_mitsuba.prior.training.vae_colour import build_colour_vae
@@ -39,7 +39,7 @@ class Kind:
     """A prior of one sort of picture.
 
     Attributes:
-        name: `geometry`, `geometry_fine`, `appearance` or `appearance_fine`.
+        name: `geometry`, `geometry_wide`, `geometry_fine`, `appearance` or `appearance_fine`.
         catalogue: bodies, parts and words.
         view_size: side in pixels of one of a mosaic's four views; the latents are twice as wide.
         make_pairs: (body, parts, seed) -> training pairs.
@@ -57,6 +57,7 @@ class Kind:
         steps: length of the schedule that makes such a prior from random weights.
         small_steps: first steps on pictures of half the size, a quarter of the cost: enough to learn what words mean.
         masked_noise: share of the pictures with noise on the part alone, as guidance with `mask_guidance` makes them.
+        rounded: share of the pictures whose part is rounded off under the noise, see `pictures.rounding`.
         prediction: what the UNet says of a noisy picture, as Diffusers names it: `v_prediction`, or `sample`, the clean
             one, which is the easiest to learn where most of it is a copy of the condition.
         build_vae: the autoencoder that goes into the folder.
@@ -80,6 +81,7 @@ class Kind:
     steps: int
     small_steps: int
     masked_noise: float
+    rounded: float
     prediction: str
     build_vae: Callable[[], AutoencoderTiny]
     conventions: dict[str, Any]
@@ -122,6 +124,7 @@ GEOMETRY = Kind(
     steps=16000,
     small_steps=1000,
     masked_noise=0.0,
+    rounded=0.0,
     prediction="sample",
     build_vae=build_vae,
     conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference"},
@@ -134,6 +137,15 @@ GEOMETRY_FINE = replace(
     make_pairs=make_fine_pairs,
     channels=(16, 32, 48, 96, 160),
     fresh_pairs=6,
+    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
+)
+GEOMETRY_WIDE = replace(
+    GEOMETRY,
+    name="geometry_wide",
+    catalogue=FINE,
+    make_pairs=make_wide_pairs,
+    fresh_pairs=6,
+    rounded=0.5,
     conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
 )
 APPEARANCE = Kind(
@@ -154,6 +166,7 @@ APPEARANCE = Kind(
     steps=10000,
     small_steps=3500,
     masked_noise=0.9,
+    rounded=0.0,
     prediction="sample",
     build_vae=build_colour_vae,
     conventions={**_CONVENTIONS, "condition": "clay", "latents": "area_mean_shine", "background": "black"},
@@ -169,7 +182,7 @@ APPEARANCE_FINE = replace(
     fresh_pairs=6,
     conventions={**APPEARANCE.conventions, "vocabulary": FINE.word_lists},
 )
-KINDS = {kind.name: kind for kind in (GEOMETRY, GEOMETRY_FINE, APPEARANCE, APPEARANCE_FINE)}
+KINDS = {kind.name: kind for kind in (GEOMETRY, GEOMETRY_WIDE, GEOMETRY_FINE, APPEARANCE, APPEARANCE_FINE)}
 
 
 def kind_named(name: str) -> Kind:
