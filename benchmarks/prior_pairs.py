@@ -117,7 +117,7 @@ NEW_CASES = (
         )
     ),
 )
-"""Words and bodies that the prior of sixteen parts does not know."""
+"""Words, and half of them bodies, that are not in `CASES`; the classifier of parts does not know them."""
 
 
 def chosen_cases(names: str) -> list[Case]:

@@ -56,12 +56,11 @@ def finished_stage(prompt: str, body: Solid, begun: Solid, grown: Solid) -> Any:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", type=int, default=6, metavar="N", help="random parts on each body; default: 6")
-    parser.add_argument("--words", default="builtin-fine", help="whose words: builtin-fine (default) or builtin")
     parser.add_argument("--json", type=Path, metavar="FILE", help="every verdict")
     options = parser.parse_args()
     torch.set_num_threads(1)
     start("llvm_ad_rgb")
-    judge, words = load_judge(), vocabulary_of(options.words)
+    judge, words = load_judge(), vocabulary_of("builtin-wide")
     assert words is not None
     rows: list[dict[str, Any]] = []
     for number, name in enumerate(words.bodies):

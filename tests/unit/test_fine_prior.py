@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch.nn.functional import avg_pool2d
 
-from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER, builtin_folder
+from fd_mitsuba.guidance.builtin import BUILTIN_FOLDER, WIDE_FOLDER, builtin_folder
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.prior.data import captions as coarse_captions
@@ -217,7 +217,7 @@ def test_every_zone_of_a_part_has_a_material(part: str) -> None:
 
 
 def test_the_shipped_weights_are_whole_and_know_the_words() -> None:
-    folder = builtin_folder(BUILTIN_FOLDER.with_name("shapes_fine"))
+    folder = builtin_folder(WIDE_FOLDER)
     conventions = json.loads((folder / "fd_mitsuba.json").read_text(encoding="utf-8"))
     assert conventions["vocabulary"] == FINE.word_lists
-    assert json.loads((folder / "unet" / "config.json").read_text(encoding="utf-8"))["sample_size"] == 128
+    assert json.loads((folder / "unet" / "config.json").read_text(encoding="utf-8"))["sample_size"] == 64

@@ -295,20 +295,20 @@ NOT_REMOVALS = (
 
 
 def test_a_prior_that_takes_parts_off_is_told_so() -> None:
-    fine = vocabulary_of("builtin-fine")
+    fine = vocabulary_of("builtin-wide")
     assert fine is not None and fine.takes_off
     for (prompt, base), (told, summary) in REMOVALS.items():
         reading = understood_prompt(prompt, fine, base, subtracts=True)
         assert (reading.caption, reading.summary()) == (told, summary)
         assert set(told.split()) <= fine.known_words()
-        with pytest.raises(UserError, match='"subtract".*builtin-fine'):
+        with pytest.raises(UserError, match=r'"subtract"/> \(--subtract beside --at\)$'):
             understood_prompt(prompt, fine, base)
 
 
 def test_what_is_taken_off_and_what_is_added_are_not_mixed_up(vocabulary: Vocabulary) -> None:
-    fine = vocabulary_of("builtin-fine")
+    fine = vocabulary_of("builtin-wide")
     assert fine is not None and not vocabulary.takes_off
-    with pytest.raises(UserError, match="builtin-fine.*lambda_sds=0"):
+    with pytest.raises(UserError, match="guidance.model=builtin-wide, which can take parts off.*lambda_sds=0"):
         understood_prompt("a mug without a handle", vocabulary, subtracts=True)
     with pytest.raises(UserError, match="asks for crown.*what to take off"):
         understood_prompt("a cat with a crown but no wings", fine, subtracts=True)

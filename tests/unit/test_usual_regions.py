@@ -10,7 +10,7 @@ import pytest
 import fd_mitsuba as fd
 from fd_mitsuba.assets.placing import placed_regions
 from fd_mitsuba.cli.main import main
-from fd_mitsuba.guidance.builtin import FINE_FOLDER
+from fd_mitsuba.guidance.builtin import WIDE_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
 from fd_mitsuba.guidance.prompted_part import prompted_part
 from fd_mitsuba.prior.data.bodies import BODIES
@@ -45,7 +45,7 @@ def test_a_region_holds_most_of_such_a_part(part: str) -> None:
 
 
 def test_all_parts_of_the_priors_have_one() -> None:
-    vocabulary = read_model_conventions(FINE_FOLDER).vocabulary
+    vocabulary = read_model_conventions(WIDE_FOLDER).vocabulary
     assert vocabulary is not None and set(USUAL_REGIONS) == set(vocabulary.parts)
 
 

@@ -20,10 +20,10 @@ def add_prior_commands(commands: argparse._SubParsersAction) -> None:
 
 
 def _prior(options: argparse.Namespace) -> int:
-    from fd_mitsuba.guidance.builtin import builtin_folder
+    from fd_mitsuba.guidance.builtin import WIDE_FOLDER, builtin_folder
     from fd_mitsuba.guidance.model_conventions import read_model_conventions
 
-    vocabulary = read_model_conventions(builtin_folder()).vocabulary
+    vocabulary = read_model_conventions(builtin_folder(WIDE_FOLDER)).vocabulary
     assert vocabulary is not None  # the shipped prior's
     words = vocabulary.model_dump(mode="json")
     if options.json:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from fd_mitsuba.cli.options import remark
+from fd_mitsuba.errors import UserError
 
 ROUNDS_OF_BODIES = 3
 """Unseen random bodies of each name on which a judge of parts is measured."""
@@ -54,15 +55,18 @@ def _prior_evaluate(options: argparse.Namespace) -> int:
     if options.kind.startswith("part_judge"):
         return _part_judge_evaluate(options)
     from fd_mitsuba.backend.threads import share_cores
-    from fd_mitsuba.prior.training.kinds import kind_named
+    from fd_mitsuba.prior.data.catalogue import COARSE
+    from fd_mitsuba.prior.training.kinds import GEOMETRY_FINE, kind_named
 
     kind = kind_named(options.kind)
     share_cores(options.threads)
-    from fd_mitsuba.config.for_model import BUILTIN, BUILTIN_FINE
+    from fd_mitsuba.config.for_model import BUILTIN, BUILTIN_WIDE
     from fd_mitsuba.guidance.builtin import builtin_folder, shipped_folder
 
     of_colours = kind.name.startswith("appearance")
-    shipped = shipped_folder(BUILTIN_FINE if kind.name.endswith("_fine") else BUILTIN, of_colours)
+    if kind.name == GEOMETRY_FINE.name and not options.folder:
+        raise UserError(f"--kind {kind.name}: no such prior is shipped; name the folder of one")
+    shipped = shipped_folder(BUILTIN if kind.catalogue is COARSE else BUILTIN_WIDE, of_colours)
     assert shipped is not None
     folder = Path(options.folder) if options.folder else builtin_folder(shipped)
     output = Path(options.output or f"runs/prior_{kind.name}.png").with_suffix(".png")

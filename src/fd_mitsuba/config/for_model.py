@@ -13,7 +13,7 @@ from fd_mitsuba.config.toml_reading import apply_override, read_toml
 from fd_mitsuba.io.json_object import read_json_object
 
 SMALL_PRESET, LARGE_PRESET = "quick", "paper"
-BUILTIN, BUILTIN_FINE = "builtin", "builtin-fine"
+BUILTIN, BUILTIN_WIDE = "builtin", "builtin-wide"
 """Names of the priors of shapes that are shipped; each goes with a prior of colours of its own."""
 _CONVENTIONS_NAME = "fd_mitsuba.json"
 """In the folder of a prior that `prior pack` made; anyone may write one for views and prompts of another model."""
@@ -29,7 +29,7 @@ class ChosenSettings:
 
 def is_builtin(model: str) -> bool:
     """Whether `guidance.model` names what is shipped with the package."""
-    return model in (BUILTIN, BUILTIN_FINE)
+    return model in (BUILTIN, BUILTIN_WIDE)
 
 
 def is_small_prior(model: str) -> bool:
@@ -121,7 +121,7 @@ _LARGE: dict[str, Callable[[Any], bool]] = {
 
 
 def _called(model: str) -> str:
-    return {BUILTIN: "the built-in prior", BUILTIN_FINE: "the fine built-in prior"}.get(model, model)
+    return {BUILTIN: "the built-in prior", BUILTIN_WIDE: "the wide built-in prior"}.get(model, model)
 
 
 def _value(config: RunConfig, key: str) -> Any:

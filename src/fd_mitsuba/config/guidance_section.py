@@ -27,7 +27,7 @@ class GuidanceConfig(Section):
     kind: Choice = Choice(kind="diffusion")
     """What guides: the diffusion model of the keys below, or a guidance of another module with its own settings."""
     model: ModelName = "builtin"
-    """`builtin`, `builtin-fine`, a folder in Stable-Diffusion layout, or a hub id."""
+    """`builtin`, `builtin-wide`, a folder in Stable-Diffusion layout, or a hub id."""
     lora: _Files = ()
     """LoRA files (.safetensors), or folders with one each, added to the model's weights."""
     lora_scale: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)] = 1.0

@@ -4,7 +4,8 @@
 
 over rings of views of the whole object and close-ups of the part, restricted to the parts that the prompt could ask for
 and "nothing", and scaled to a sum of 1. Only views that show the part count. What the base has by itself (a cat's tail)
-says nothing, since the judge sees each view before and after; a bare region or a lump is "nothing" to it. And the
+says nothing, since the judge sees each view before and after; a bare region or a lump is "nothing" to it. Bat wings
+count for a prompt that asks for wings, and a top hat for one that asks for a hat, not the other way round. And the
 prompt's part must be clearly likelier than it was at the start: a region like a wing that stayed is no wing.
 """
 
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 
 from fd_mitsuba.config import RunConfig
-from fd_mitsuba.config.for_model import BUILTIN_FINE
+from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.evaluation.part_judge import (
     CAMERA_RADIUS,
@@ -35,6 +36,7 @@ from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
 from fd_mitsuba.render.geometry_pass import GeometryPass
+from fd_mitsuba.runs.scene_model import model_for_scene
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.geometry_stage import GeometryStage
@@ -134,18 +136,28 @@ def judge_part(
     if wanted not in parts:
         return None
     edited, start = (list(_pairs(stage, surface)) for surface in (stage.surface(), stage.start_surface()))
-    shares, views = part_shares(judge, parts, edited)
-    begun, _ = part_shares(judge, parts, start)
-    ranked = sorted(zip((*parts, NOTHING), shares, strict=True), key=lambda item: -item[1])
-    own = parts.index(wanted)
-    return Verdict(wanted, dict(ranked), _log_odds(shares[own]) - _log_odds(begun[own]), views, name)
+    (said, views), (begun, _) = (part_shares(judge, parts, pictures) for pictures in (edited, start))
+    shares, before = (_with_kinds(dict(zip((*parts, NOTHING), found, strict=True)), wanted) for found in (said, begun))
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    return Verdict(wanted, dict(ranked), _log_odds(shares[wanted]) - _log_odds(before[wanted]), views, name)
+
+
+def _with_kinds(shares: dict[str, float], wanted: str) -> dict[str, float]:
+    """The shares, with those of the wanted part's kinds in its own: "bat wings" are "wings".
+
+    >>> _with_kinds({"wings": 0.5, "bat wings": 0.25, "nothing": 0.25}, "wings")
+    {'wings': 0.75, 'nothing': 0.25}
+    """
+    kinds = {name for name in shares if name.endswith(f" {wanted}")}
+    own = shares[wanted] + sum(shares[name] for name in kinds)
+    return {name: own if name == wanted else share for name, share in shares.items() if name not in kinds}
 
 
 def can_be_judged(scene: EditScene, config: RunConfig) -> bool:
     """Whether the built-in judge can say if a run looks like its prompt: the prompt guides the shape, and asks for one
     part, in the judge's words, to be added.
     """
-    vocabulary, judged = _words(config), vocabulary_of(BUILTIN_FINE)
+    vocabulary, judged = _words(model_for_scene(config, scene)[0]), vocabulary_of(BUILTIN_WIDE)
     if config.geometry.lambda_sds == 0 or scene.subtracts or vocabulary is None or judged is None:
         return False
     return _wanted(scene, vocabulary) in judged.parts
@@ -188,7 +200,7 @@ def part_shares(
 
 def _words(config: RunConfig) -> Vocabulary | None:
     """The guidance model's own, or for a model that knows any word, those of the judge."""
-    return vocabulary_of(config.guidance.model) or vocabulary_of(BUILTIN_FINE)
+    return vocabulary_of(config.guidance.model) or vocabulary_of(BUILTIN_WIDE)
 
 
 def _wanted(scene: EditScene, vocabulary: Vocabulary) -> str | None:

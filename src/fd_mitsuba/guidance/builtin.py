@@ -6,13 +6,13 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin
+from fd_mitsuba.config.for_model import BUILTIN_WIDE, is_builtin
 from fd_mitsuba.errors import UserError
 
 BUILTIN_FOLDER = Path(__file__).resolve().parent.parent / "weights" / "shapes"
-FINE_FOLDER = BUILTIN_FOLDER.with_name("shapes_fine")
+WIDE_FOLDER = BUILTIN_FOLDER.with_name("shapes_wide")
 APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours")
-FINE_APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours_fine")
+WIDE_APPEARANCE_FOLDER = BUILTIN_FOLDER.with_name("colours_wide")
 SUMS_NAME = "SHA256SUMS"
 
 
@@ -24,8 +24,8 @@ def shipped_folder(model: str, appearance: bool = False) -> Path | None:
     """
     if not is_builtin(model):
         return None
-    if model == BUILTIN_FINE:
-        return FINE_APPEARANCE_FOLDER if appearance else FINE_FOLDER
+    if model == BUILTIN_WIDE:
+        return WIDE_APPEARANCE_FOLDER if appearance else WIDE_FOLDER
     return APPEARANCE_FOLDER if appearance else BUILTIN_FOLDER
 
 

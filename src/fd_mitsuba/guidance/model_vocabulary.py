@@ -13,7 +13,7 @@ def vocabulary_of(model: str, appearance: bool = False) -> Vocabulary | None:
     """The words that a guidance model was trained with; None where nobody has listed them, as of Stable Diffusion.
 
     Args:
-        model: `builtin`, `builtin-fine`, a folder, or a hub id, of which nothing is known.
+        model: `builtin`, `builtin-wide`, a folder, or a hub id, of which nothing is known.
         appearance: of a built-in one, the prior of the appearance stage.
     """
     folder = shipped_folder(model, appearance) or Path(model).expanduser()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fd_mitsuba.config.for_model import BUILTIN_FINE
+from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 
@@ -13,7 +13,7 @@ def prompted_part(prompt: str | None, base_prompt: str = "") -> str | None:
     >>> prompted_part("a duck wearing sunglasses"), prompted_part("a duck with a crown and a cape")
     ('glasses', None)
     """
-    vocabulary = vocabulary_of(BUILTIN_FINE) if prompt else None
+    vocabulary = vocabulary_of(BUILTIN_WIDE) if prompt else None
     if vocabulary is None:
         return None
     parts = read_prompt(prompt or "", vocabulary, base_prompt).parts

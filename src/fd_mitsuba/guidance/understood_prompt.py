@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fd_mitsuba.config.for_model import BUILTIN_FINE
+from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import PromptReading, read_prompt
@@ -30,7 +30,7 @@ def understood_prompt(
         raise UserError(
             f"prompt {prompt!r}: asks for no part, only for no {off}, where the focal regions add; name what to "
             'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> '
-            f"(--subtract beside --at) and set guidance.model={BUILTIN_FINE}"
+            f"(--subtract beside --at){'' if vocabulary.takes_off else f' and set guidance.model={BUILTIN_WIDE}'}"
         )
     raise UserError(f"prompt {prompt!r}: {_unknown(reading, prompt, vocabulary, base_prompt)}")
 
@@ -39,7 +39,7 @@ def _understood_removal(prompt: str, vocabulary: Vocabulary, base_prompt: str) -
     if not vocabulary.takes_off:
         raise UserError(
             "the focal regions subtract, and this prior knows only parts that are added; set "
-            f"guidance.model={BUILTIN_FINE}, which can take parts off, or geometry.lambda_sds=0 to cut out the regions "
+            f"guidance.model={BUILTIN_WIDE}, which can take parts off, or geometry.lambda_sds=0 to cut out the regions "
             "as they are, or guidance.model to a Stable Diffusion folder"
         )
     reading = read_prompt(prompt, vocabulary, base_prompt)
@@ -68,11 +68,12 @@ def _unknown(reading: PromptReading, prompt: str, vocabulary: Vocabulary, base_p
     """What the prior does not know, and what may have been meant."""
     unknown = ", ".join(map(repr, reading.unknown_parts))
     which = f"knows no part {unknown}" if unknown else "knows no such part"
-    if (fine := vocabulary_of(BUILTIN_FINE)) is not None and vocabulary != fine:
-        if known := read_prompt(prompt, fine, base_prompt).parts:
+    wide = vocabulary_of(BUILTIN_WIDE)
+    if wide is not None and vocabulary.parts != wide.parts:
+        if known := read_prompt(prompt, wide, base_prompt).parts:
             return (
-                f"the built-in prior {which}, but the fine one knows {', '.join(known)}; "
-                f"set guidance.model={BUILTIN_FINE}"
+                f"this prior {which}, but the wide built-in one knows {', '.join(known)}; "
+                f"set guidance.model={BUILTIN_WIDE}"
             )
     hint = " or ".join(map(repr, reading.nearest)) or ", ".join(vocabulary.parts)
     return (

@@ -16,6 +16,7 @@ from fd_mitsuba.runs.check_report import BaseCheck, CheckReport, RegionCheck
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import estimate_cost
 from fd_mitsuba.runs.model_check import check_model
+from fd_mitsuba.runs.scene_model import model_for_scene
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs, check_shading
 from fd_mitsuba.scene.base_appearance import base_shapes
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -36,7 +37,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         UserError: what a run would refuse: a part all of whose regions lie within the base, settings that name what is
             not registered or give it wrong options.
     """
-    config = checked_choices(config)
+    config, _ = model_for_scene(checked_choices(config), scene)
     refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     reading, part_readings, refusal = _prompts(scene, config)
     base = tuple(

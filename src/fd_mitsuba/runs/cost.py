@@ -9,7 +9,7 @@ import numpy as np
 from fd_mitsuba.backend.speed import processor_speed
 from fd_mitsuba.backend.threads import cores_in_use
 from fd_mitsuba.config import GuidanceConfig, RunConfig
-from fd_mitsuba.config.for_model import BUILTIN_FINE, is_builtin, is_small_prior
+from fd_mitsuba.config.for_model import is_builtin, is_small_prior
 from fd_mitsuba.conventions import GRID_HALF_EXTENT, STAGES
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.drafter import STEPS as DDIM_STEPS
@@ -46,9 +46,6 @@ _SECONDS_PER_MILLION_TEXELS = 3.5
 _USUAL_TEXELS = 512**2
 """Of a baked texture; so many are in the seconds above."""
 
-_FINER = 2.2
-"""How many times as long the fine prior takes for a view."""
-
 _REACH = 0.15
 """How far around its regions a part is evaluated: that of `extraction.surface`, without its imports."""
 
@@ -81,7 +78,7 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
     them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores of
     104 GFLOP/s, no GPU: 0.125 s a step of `configs/quick.toml`, 0.178 s on the grid of 128 cells a side, 0.297 s in the
-    refined phase, 0.201 s with `builtin-fine`; all else of a geometry run took 18 s. All of them are scaled by how fast
+    refined phase; all else of a geometry run took 18 s. All of them are scaled by how fast
     this machine's core is at this moment.
     """
     geometry, guidance = config.geometry, config.guidance
@@ -106,8 +103,8 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     speed = None if builtin or not guided else _speed(guidance)
     passes = (1 - refined) * _coarse_passes(scene, config) + refined * _passes(scene, config, "refined")
     if speed is None:
-        encoder = 0.0082 * slower * (0.75 + 0.5 / cores)  # four views are one picture to it; measured with two cores
-        forward = encoder * (_FINER if guidance.model == BUILTIN_FINE else 1.0)
+        forward = 0.0082 * slower * (0.75 + 0.5 / cores)  # four views are one picture to it; measured with two cores
+        encoder = forward
     else:
         # Stable Diffusion's layout: 800 operations a weight at a 64x64 latent, 2.2e12 to encode a picture and back.
         forward, encoder = (side / 64) ** 2 * 800.0 * weights / speed.unet, (side / 64) ** 2 * 2.2e12 / speed.vae

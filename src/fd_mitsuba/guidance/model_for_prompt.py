@@ -1,0 +1,41 @@
+"""Which of the shipped priors a prompt is for, where the settings leave it to the package.
+
+`builtin` knows sixteen parts, and knows them well; `builtin-wide` knows sixteen more, more bodies, and how to take a
+part off. Where a prompt asks for what only the latter knows, it takes the former's place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.config.for_model import BUILTIN, BUILTIN_WIDE
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
+from fd_mitsuba.guidance.prompt_reader import read_prompt
+
+
+def model_for_prompt(
+    config: RunConfig, prompts: Sequence[str], base_prompt: str = "", subtracts: bool = False
+) -> tuple[RunConfig, str | None]:
+    """The settings with the prior that knows the parts of the prompts, and a line about it where it is another one.
+
+    Args:
+        prompts: of the run, and of single parts.
+        subtracts: whether the focal regions cut, so that the prompts take something off.
+
+    >>> config, line = model_for_prompt(RunConfig(), ["a cat with a halo"])
+    >>> config.guidance.model, line
+    ('builtin-wide', 'guidance.model: builtin-wide, which knows halo')
+    """
+    few, many = vocabulary_of(BUILTIN), vocabulary_of(BUILTIN_WIDE)
+    if config.guidance.model != BUILTIN or few is None or many is None:
+        return config, None
+    wanted: list[str] = []
+    for prompt in prompts:
+        before, reading = (read_prompt(prompt, words, base_prompt) for words in (few, many))
+        wanted += [part for part in reading.parts if part not in before.parts]
+    if not wanted and not subtracts:
+        return config, None
+    guidance = config.guidance.model_copy(update={"model": BUILTIN_WIDE})
+    why = "takes parts off" if subtracts else f"knows {', '.join(dict.fromkeys(wanted))}"
+    return config.model_copy(update={"guidance": guidance}), f"guidance.model: {BUILTIN_WIDE}, which {why}"

@@ -1,0 +1,16 @@
+"""Which of the shipped priors a scene's prompts are for."""
+
+from __future__ import annotations
+
+from fd_mitsuba.config import RunConfig
+from fd_mitsuba.guidance.model_for_prompt import model_for_prompt
+from fd_mitsuba.scene.edit_scene import EditScene
+
+
+def model_for_scene(config: RunConfig, scene: EditScene) -> tuple[RunConfig, str | None]:
+    """As `model_for_prompt`, for a run of the scene, where a prompt guides it at all."""
+    guided = config.geometry.lambda_sds > 0 or config.appearance.lambda_sds > 0
+    if config.guidance.kind.kind != "diffusion" or not guided:
+        return config, None
+    single = [own.prompt for own in scene.part_prompts.values()]
+    return model_for_prompt(config, [scene.prompt, *single], scene.base_prompt, scene.subtracts)
