@@ -99,7 +99,8 @@ class ObjectPlaces:
         """At the height of its eyes; within what a head can have of the longest side."""
         around = self._eye_level()
         width = float(np.ptp(np.quantile(around[:, 0], (0.02, 0.98))))
-        return float(np.clip(width, *(share * self.longest_side for share in _HEAD_WIDTHS)))
+        least, most = (share * self.longest_side for share in _HEAD_WIDTHS)
+        return min(max(width, least), most)
 
     @property
     def _height(self) -> float:

@@ -93,7 +93,8 @@ def usual_region(part: str | None, place: Place) -> UsualRegion | None:
 
 def usual_place(part: str | None) -> str:
     """Where `--at` puts a part where nothing is said; on the head of what is not known."""
-    return USUAL_REGIONS[part].place if part in USUAL_REGIONS else "head"
+    usual = USUAL_REGIONS.get(part or "")
+    return "head" if usual is None else usual.place
 
 
 def region_for(usual: UsualRegion, places: ObjectPlaces, place: Place, name: str | None = None) -> PlacedRegion:
