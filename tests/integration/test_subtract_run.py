@@ -285,11 +285,11 @@ def test_bad_cuts_end_in_one_line(name: str, make_scene: Make, ball: str, tmp_pa
     assert "\n" not in message and "scene.xml" in message and all(word in message for word in words), message
 
 
-def test_the_built_in_prior_says_that_it_cannot_cut(
+def test_a_prompt_that_adds_does_not_fit_a_cut(
     make_scene: Make, ball: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = make_scene(base=ball, region=region())
     assert main(["run", str(scene), "-o", str(tmp_path / "run"), "--stage", "geometry"]) != 0
     error = capsys.readouterr().err
-    assert "lambda_sds=0" in error and len(error.strip().splitlines()) == 1
+    assert "say what to take off" in error and "lambda_sds=0" in error and len(error.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()

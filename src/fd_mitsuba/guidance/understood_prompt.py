@@ -47,7 +47,8 @@ def _understood_removal(prompt: str, vocabulary: Vocabulary, base_prompt: str) -
         wanted = ", ".join(reading.parts)
         raise UserError(
             f"prompt {prompt!r}: asks for {wanted}, where the focal regions subtract; say what to take off, as in "
-            '"a mug without a handle", or leave mode="subtract" out'
+            '"a mug without a handle", leave mode="subtract" out, or set geometry.lambda_sds=0 to cut out the '
+            "regions as they are"
         )
     if not reading.caption:
         off = ", ".join(map(repr, (*reading.removed, *reading.ignored)))
