@@ -97,7 +97,7 @@ def import_asset(
             raise UserError(f"{name}: is blank; describe the object")
     told = [None if text is None else " ".join(text.split()) for text in (prompt, base_prompt)]
     lit = _LIGHT if light is None else Path(light)
-    part = None if subtract else prompted_part(told[0], told[1] or "")
+    part = prompted_part(told[0], told[1] or "", removed=subtract)
     return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size, subtract, part)
 
 

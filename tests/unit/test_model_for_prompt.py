@@ -13,7 +13,7 @@ from fd_mitsuba.config import RunConfig
 from fd_mitsuba.evaluation.verdict import can_be_judged
 from fd_mitsuba.guidance.model_for_prompt import model_for_prompt
 from fd_mitsuba.runs.check import check_scene
-from fd_mitsuba.runs.scene_model import model_for_scene
+from fd_mitsuba.runs.scene_model import model_for_run, model_for_scene
 from fd_mitsuba.scene.load_scene import load_edit_scene
 
 QUICK = RunConfig.load("quick")
@@ -46,6 +46,15 @@ def test_a_part_of_its_own_counts_and_so_does_a_cut() -> None:
 def test_a_model_that_was_named_stays() -> None:
     named = RunConfig.load("quick", ["guidance.model=owner/stable-diffusion"])
     assert model_for_prompt(named, ["a cat with a halo"]) == (named, None)
+
+
+def test_a_run_that_has_begun_keeps_its_model(make_scene: Callable[..., Path], tmp_path: Path) -> None:
+    scene = load_edit_scene(make_scene(integrator=INTEGRATOR.replace("two wings", "a hat")))
+    assert model_for_run(QUICK, scene, tmp_path)[0].guidance.model == "builtin-wide"
+    (tmp_path / "config.json").write_text('{"guidance": {"model": "builtin"}}')
+    assert model_for_run(QUICK, scene, tmp_path) == (QUICK, None)
+    (tmp_path / "config.json").write_text('{"guidance": {"model": "builtin-wide"}}')
+    assert model_for_run(QUICK, scene, tmp_path)[0].guidance.model == "builtin-wide"
 
 
 def test_runs_and_checks_take_it(make_scene: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:

@@ -301,7 +301,7 @@ def test_a_prior_that_takes_parts_off_is_told_so() -> None:
         reading = understood_prompt(prompt, fine, base, subtracts=True)
         assert (reading.caption, reading.summary()) == (told, summary)
         assert set(told.split()) <= fine.known_words()
-        with pytest.raises(UserError, match=r'"subtract"/> \(--subtract beside --at\)$'):
+        with pytest.raises(UserError, match=r'"subtract"/> \(--subtract\)$'):
             understood_prompt(prompt, fine, base)
 
 

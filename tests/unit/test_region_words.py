@@ -14,6 +14,7 @@ import fd_mitsuba as fd
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.data.fine.bodies import BODIES
+from fd_mitsuba.prior.data.primitives import lathe
 from fd_mitsuba.scene.load_scene import load_base, load_edit_scene
 from fd_mitsuba.scene.region_size import region_size
 from fd_mitsuba.scene.region_words import ObjectPlaces
@@ -70,6 +71,19 @@ def test_heads_and_eyes_are_where_the_makers_of_bodies_say(name: str) -> None:
     face = places.find("front of the head").point
     assert abs(face[1] - body.eyes()[0, 1]) < 0.02 * places.longest_side
     assert body.head_top[2] < face[2] < body.eyes()[0, 2] + 0.1 * places.longest_side
+
+
+def test_the_top_of_an_open_vessel_is_at_its_rim() -> None:
+    cup = lathe([(0.9, 0.0), (1.0, 0.1), (1.0, 2.0), (0.9, 2.0), (0.9, 0.2), (0.1, 0.2)])
+    places = ObjectPlaces(cup.vertices, cup.faces)
+    for word in ("top", "head"):
+        assert np.allclose(places.find(word).point, [0, 2, 0], atol=0.1)
+
+
+def test_faces_may_look_inwards() -> None:
+    body = BODIES["horse"](np.random.default_rng(1)).solid
+    heads = [ObjectPlaces(body.vertices, faces).find("head").point for faces in (body.faces, body.faces[:, ::-1])]
+    assert np.allclose(*heads, atol=0.03)
 
 
 def test_front_and_rear_are_the_ends(beast: ObjectPlaces) -> None:

@@ -56,6 +56,9 @@ def test_sizes_and_places_that_are_said_count() -> None:
     assert np.allclose(2 * said.half_axes, 0.2 * places.longest_side) and "usual" not in about[0]
     (elsewhere,), _ = placed_regions(places, ["left side"], None, part="skateboard")
     assert np.allclose(2 * elsewhere.half_axes, 0.3 * places.longest_side)  # nothing is usual there
+    (cape,), about = placed_regions(places, ["0,0.1,-2"], None, part="cape")
+    assert cape.half_axes[0] > 1.2 * cape.half_axes[1] and "the usual size for cape" in about[0]  # there, and not below
+    assert np.abs(cape.centre - places.find("0,0.1,-2").point).max() < 0.06 * places.longest_side
     (hat,), about = placed_regions(places, ["left side"], None, part="crown")
     assert hat.half_axes[0] > 1.5 * hat.half_axes[1] and "the usual size for crown" in about[0]
     (hole,), _ = placed_regions(places, ["head"], None, subtract=True, part="crown")
@@ -68,6 +71,8 @@ def test_a_mesh_needs_nothing_but_a_prompt(tmp_path: Path) -> None:
     assert any("puts the region at its bottom" in line for line in made.remarks)
     scene = fd.load_scene(made.scene)
     assert scene.regions[0].name == "bottom"
+    off = fd.import_asset(ASSETS / "duck.stl", tmp_path / "off", prompt="a duck without a tail", subtract=True)
+    assert off.regions[0].startswith("rear: ") and off.regions[0].endswith("subtracts")
     plain = fd.import_asset(ASSETS / "duck.stl", tmp_path / "plain", prompt="a duck with a spaceship")
     assert plain.regions[0].startswith("head: ") and "usual" not in plain.regions[0]
 

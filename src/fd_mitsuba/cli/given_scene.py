@@ -57,7 +57,7 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
     told = definitions(options)
     # A scene without any prompt says so when it is loaded.
     told_prompt = options.prompt or scene_prompt(Path(options.scene), told)
-    part = None if options.subtract else prompted_part(told_prompt)
+    part = prompted_part(told_prompt, removed=options.subtract)
     how = options.at, options.size, target, options.subtract, part
     about = write_placed_regions(Path(options.scene), told, *how)
     for line in about:

@@ -1,7 +1,7 @@
-"""Which of the shipped priors a prompt is for, where the settings leave it to the package.
+"""Which of the shipped priors a prompt is for: `guidance.model = "builtin"` leaves that to the package.
 
-`builtin` knows sixteen parts, and knows them well; `builtin-wide` knows sixteen more, more bodies, and how to take a
-part off. Where a prompt asks for what only the latter knows, it takes the former's place.
+The prior of that name knows sixteen parts, and knows them well; `builtin-wide` knows sixteen more, more bodies, and how
+to take a part off. Where a prompt asks for what only the latter knows, it takes the former's place.
 """
 
 from __future__ import annotations

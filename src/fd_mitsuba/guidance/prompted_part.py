@@ -7,8 +7,11 @@ from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 
 
-def prompted_part(prompt: str | None, base_prompt: str = "") -> str | None:
+def prompted_part(prompt: str | None, base_prompt: str = "", removed: bool = False) -> str | None:
     """The part's usual name; None where the prompt asks for none that any shipped prior knows, or for several.
+
+    Args:
+        removed: the part that it wants off.
 
     >>> prompted_part("a duck wearing sunglasses"), prompted_part("a duck with a crown and a cape")
     ('glasses', None)
@@ -16,5 +19,6 @@ def prompted_part(prompt: str | None, base_prompt: str = "") -> str | None:
     vocabulary = vocabulary_of(BUILTIN_WIDE) if prompt else None
     if vocabulary is None:
         return None
-    parts = read_prompt(prompt or "", vocabulary, base_prompt).parts
+    reading = read_prompt(prompt or "", vocabulary, base_prompt)
+    parts = reading.removed if removed else reading.parts
     return parts[0] if len(parts) == 1 else None

@@ -30,7 +30,7 @@ def understood_prompt(
         raise UserError(
             f"prompt {prompt!r}: asks for no part, only for no {off}, where the focal regions add; name what to "
             'add, or, to take something off, give the focal region <string name="mode" value="subtract"/> '
-            f"(--subtract beside --at){'' if vocabulary.takes_off else f' and set guidance.model={BUILTIN_WIDE}'}"
+            "(--subtract)"
         )
     raise UserError(f"prompt {prompt!r}: {_unknown(reading, prompt, vocabulary, base_prompt)}")
 

@@ -52,7 +52,7 @@ from fd_mitsuba.runs.photographs import write_photographs
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
-from fd_mitsuba.runs.scene_model import model_for_scene
+from fd_mitsuba.runs.scene_model import model_for_run
 from fd_mitsuba.runs.scene_size import SceneSize
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.region_place import refuse_hidden_parts
@@ -117,7 +117,7 @@ def run(
         started = time.monotonic()
         config = checked_choices(config)
         if guidance is None:
-            config, chosen = model_for_scene(config, scene)
+            config, chosen = model_for_run(config, scene, folder)
             opening = [*opening, *([chosen] if chosen else [])]
         refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
         if guidance is not None:

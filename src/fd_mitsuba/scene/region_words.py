@@ -20,6 +20,8 @@ _REACH, _REACH_OF_FACE = 0.3, 1.0
 face goes round it."""
 _HEAD_WIDTHS = 0.17, 0.44
 """Least and largest width of a head, as shares of the longest side: what is put on a mug is no wider."""
+_HOLLOW = 0.5
+"""Of the height: what is so far below the top, seen from above, is the floor of a vessel."""
 _FEET_APART = 0.4
 """Least length of what an animal on four legs stands on, as a share of its height."""
 _SAMPLES = 20_000
@@ -32,6 +34,8 @@ _SYNONYMS = {
     "behind": "rear", "back side": "rear", "backside": "rear", "top of the head": "head", "on the head": "head",
     "top of head": "head", "chest": "front",
 }  # fmt: skip
+POINT = "point"
+"""Name of a place that is no word."""
 WORDS = ("top", "head", "back", "front", "rear", "left side", "right side", "bottom")
 """What `--at` knows, beside `front of the head` and the like, and points."""
 
@@ -238,6 +242,8 @@ class ObjectPlaces:
             aim = points[along >= along.max() - 0.15 * reach].mean(axis=0)
         start = aim + direction * (2 * self.longest_side)
         hit = self._rays.first(start, -direction)
+        if hit is not None and direction is _UP and hit[1] < self.high[1] - _HOLLOW * self._height:
+            hit = np.array([hit[0], points[:, 1].max(), hit[2]])  # in the middle of a rim, not on the floor below
         if hit is None:
             near = points[along >= along.max() - 0.15 * reach]
             hit = near[np.argmin(np.linalg.norm(near - aim, axis=1))]
@@ -252,14 +258,14 @@ class ObjectPlaces:
             raise UserError(f"--at {text}: is no point; write x,y,z in the scene's unit, such as 0,1.5,0.2")
         hit = MeshDistance(self.vertices, self.faces).feet(point[None])[0]
         shown = ", ".join(f"{value:.4g}" for value in hit)
-        return Place("point", hit, self._outward(hit), f"the nearest point of its surface, ({shown})")
+        return Place(POINT, hit, self._outward(hit), f"the nearest point of its surface, ({shown})")
 
     def _seen(self, text: str, origin: np.ndarray, direction: np.ndarray) -> Place:
         hit = self._rays.first(origin, direction)
         if hit is None:
             raise UserError(f"--at {text}: nothing of the object is seen at that pixel; take one of the object itself")
         shown = ", ".join(f"{value:.4g}" for value in hit)
-        return Place("point", hit, self._outward(hit), f"what is seen at that pixel, ({shown})")
+        return Place(POINT, hit, self._outward(hit), f"what is seen at that pixel, ({shown})")
 
     def _outward(self, point: np.ndarray) -> np.ndarray:
         """The mean normal of the surface within a twentieth of the object around a point."""

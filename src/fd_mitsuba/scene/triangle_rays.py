@@ -10,7 +10,7 @@ class TriangleRays:
     """Casts rays at triangles.
 
     Args:
-        corners: (F, 3, 3), outward.
+        corners: (F, 3, 3); which side is outside follows from the volume that they enclose.
 
     >>> square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
     >>> TriangleRays(square).first(np.array([0.2, 0.3, 2.0]), np.array([0, 0, -1.0])).tolist()
@@ -19,6 +19,9 @@ class TriangleRays:
 
     def __init__(self, corners: Float[np.ndarray, "F 3 3"]) -> None:
         self._a, self._b, self._c = np.asarray(corners, dtype=np.float64).transpose(1, 0, 2)
+        middle = self._a.mean(axis=0)
+        volume = np.einsum("ij,ij->i", self._a - middle, np.cross(self._b - middle, self._c - middle)).sum()
+        self._outward = -1 if volume < 0 else 1
 
     def first(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """(3,) the first point of the surface along a ray; None: it meets nothing."""
@@ -46,4 +49,4 @@ class TriangleRays:
             t = np.einsum("ij,ij->i", c - a, turned) * inverse
             found = np.flatnonzero((u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0))
         found = found[np.argsort(t[found], kind="stable")]
-        return t[found], -np.sign(determinant[found]).astype(int)
+        return t[found], -self._outward * np.sign(determinant[found]).astype(int)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fd_mitsuba.scene.region_words import ObjectPlaces, Place, PlacedRegion, upright
+from fd_mitsuba.scene.region_words import POINT, ObjectPlaces, Place, PlacedRegion, upright
 
 _ROOM = 1.35
 """How much larger than its usual part a region is: an ellipsoid holds a cylinder that is 1.41 times smaller."""
@@ -88,7 +88,7 @@ def usual_region(part: str | None, place: Place) -> UsualRegion | None:
     if usual is None or usual.place == "head":
         return usual
     own = usual.place.replace(" the ", " ").replace(" ", "_")
-    return usual if place.name in (own, own.replace("left", "right")) else None
+    return usual if place.name in (own, own.replace("left", "right"), POINT) else None
 
 
 def usual_place(part: str | None) -> str:
@@ -103,5 +103,6 @@ def region_for(usual: UsualRegion, places: ObjectPlaces, place: Place, name: str
     half = _ROOM * unit * np.asarray(usual.size) / 2
     level = abs(place.normal[1]) < _LEVEL
     shift = np.array([0.0, usual.up if level else 0.0, 0.0 if level else usual.ahead])
+    shift *= place.name != POINT  # there, and not beside it
     centre = place.point + unit * (usual.out * place.normal + shift)
     return PlacedRegion(name or place.name, centre, half, upright(place.normal))
