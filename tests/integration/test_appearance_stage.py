@@ -134,7 +134,7 @@ def test_style_consistency_ties_the_part_to_the_base(scene: EditScene, lump: Sim
 
 @pytest.mark.usefixtures("one_thread")
 def test_the_dual_path_leaves_the_base_and_a_single_path_does_not(scene: EditScene, lump: SimpleNamespace) -> None:
-    """Two scenes are built: on more threads the acceleration structure of one in seventy differs in a last digit."""
+    """Two scenes are built: now and then the acceleration structure of one differs in a last digit."""
     cameras = ring_cameras(4, np.zeros(3))
     drift = {}
     for single in (False, True):
@@ -148,7 +148,7 @@ def test_the_dual_path_leaves_the_base_and_a_single_path_does_not(scene: EditSce
         seen = (plain.base_mask > 0.999).expand(-1, 3, -1, -1)
         picture = after.merged if single else after.base_path
         drift[single] = float((picture - truth)[seen].abs().mean())
-    assert drift[False] == 0.0 and drift[True] > 1e-3
+    assert drift[False] < 1e-8 and drift[True] > 1e-3  # 3e-10 where a ray meets another last digit
 
 
 def test_base_pixels_are_those_of_the_base_alone(scene: EditScene, lump: SimpleNamespace) -> None:
