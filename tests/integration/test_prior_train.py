@@ -114,6 +114,11 @@ def test_random_weights_learn_colour_words(tmp_path: Path) -> None:
     assert error(captions) < 0.75 * error(captions[1:] + captions[:1])
 
 
+def test_a_kind_that_is_not_shipped_needs_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["prior", "evaluate", "--kind", "geometry_fine"]) == 1
+    assert "no such prior is shipped; name the folder of one" in capsys.readouterr().err
+
+
 def test_kinds_are_named() -> None:
     assert {kind_named(name).name for name in KINDS} == {
         "geometry",

@@ -96,7 +96,8 @@ def import_file(
     orientation = find_orientation(vertices, faces, suffix, (asset.up, asset.front), (wanted[0], wanted[1]))
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
-    regions, about = placed_regions(places, at or (usual_place(part),), size, subtract, part)
+    usual = usual_place(part)
+    regions, about = placed_regions(places, at or (usual,), size, subtract, part)
     words = _words(path)
     text = SceneText(
         prompt=prompt or words,
@@ -110,7 +111,7 @@ def import_file(
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
     if not at:
-        where = "on its head" if usual_place(part) == "head" else f"at {places.find(usual_place(part)).about}"
+        where = "on its head" if usual == "head" else f"at {places.find(usual).about}"
         remarks.append(f"puts the region {where}; --at says otherwise: top, back, 'left side', x,y,z and the like")
     if prompt is None:
         remarks.append(f"calls it {text.prompt!r}; give the prompt of a run with --prompt")

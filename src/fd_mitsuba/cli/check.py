@@ -25,17 +25,13 @@ def _check(options: argparse.Namespace) -> int:
     settings = chosen_settings(options)
     scene = load(options, config=settings.config)
     from fd_mitsuba.runs.check import check_scene
-    from fd_mitsuba.runs.scene_model import model_for_scene
 
-    config, model = model_for_scene(settings.config, scene)
-    report = check_scene(scene, config)
+    report = check_scene(scene, settings.config)
     if options.json:
         print(json.dumps(report.to_json(), indent=2))
     else:
         if settings.remark:
             say(settings.remark.replace(": ", " ", 1))
-        if model:
-            say(model.replace(": ", " ", 1))
         say("\n".join(report.lines()))
     if report.refusal is not None:
         raise UserError(report.refusal)

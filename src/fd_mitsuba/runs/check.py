@@ -37,7 +37,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         UserError: what a run would refuse: a part all of whose regions lie within the base, settings that name what is
             not registered or give it wrong options.
     """
-    config, _ = model_for_scene(checked_choices(config), scene)
+    config, model = model_for_scene(checked_choices(config), scene)
     refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
     reading, part_readings, refusal = _prompts(scene, config)
     base = tuple(
@@ -75,6 +75,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
         part_readings=part_readings,
         surroundings=tuple(scene.surroundings_ids),
         base_choice=scene.base_choice,
+        model_choice=model or "",
         refusal=refusal,
     )
 

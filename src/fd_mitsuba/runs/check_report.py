@@ -68,6 +68,7 @@ class CheckReport:
     surroundings: tuple[str, ...] = ()
     """Shapes of the scene that are not edited, as exports call them."""
     base_choice: str = ""
+    model_choice: str = ""
     """How it was found out which shapes are edited, where the scene does not say."""
     refusal: str | None = None
     """Why a run with these settings would end before its first step; None: it would not."""
@@ -79,6 +80,8 @@ class CheckReport:
     def lines(self) -> list[str]:
         """The report as lines for a person, warnings last."""
         lines = [f"scene    {self.scene}", f"prompt   {self.prompt}"]
+        if self.model_choice:
+            lines.append(f"model    {self.model_choice.removeprefix('guidance.model: ')}")
         if self.prompt_reading is not None:
             lines.append(f"read as  {self.prompt_reading.summary()}")
             lines.append(f"         the prior is told {self.prompt_reading.caption!r}")

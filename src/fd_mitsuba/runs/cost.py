@@ -78,8 +78,8 @@ def estimate_cost(scene: EditScene, config: RunConfig) -> CostEstimate:
     averaged over the phases: a refined step renders eight times as many pixels a side and, with Stable Diffusion, sends
     them through the VAE's encoder and back. The constants are fitted to runs of the pegasus scene with 2 cores of
     104 GFLOP/s, no GPU: 0.125 s a step of `configs/quick.toml`, 0.178 s on the grid of 128 cells a side, 0.297 s in the
-    refined phase; all else of a geometry run took 18 s. All of them are scaled by how fast
-    this machine's core is at this moment.
+    refined phase; all else of a geometry run took 18 s. All of them are scaled by how fast this machine's core is at
+    this moment.
     """
     geometry, guidance = config.geometry, config.guidance
     axis = np.linspace(-GRID_HALF_EXTENT, GRID_HALF_EXTENT, 41)

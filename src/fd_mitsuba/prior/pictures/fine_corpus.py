@@ -1,4 +1,4 @@
-"""Training mosaics of the finer prior: views of 64 pixels, parts added, taken away, and beside parts that stay."""
+"""Training mosaics of the finer and the wide prior: parts added, taken away, and beside parts that stay."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def grow_wide(part: str, surface: Surface, rng: np.random.Generator) -> Solid | 
 
 
 def make_wide_pairs(body: str, parts: list[str | None], seed: int) -> list[FinePair]:
-    """All bodies and parts in views of 32 pixels."""
+    """`make_fine_pairs` in views of 32 pixels, for the wide prior."""
     return make_fine_pairs(body, parts, seed, PLAIN_VIEW_SIZE, grow_wide)
 
 
