@@ -141,7 +141,7 @@ def evaluate_parts(
         found = [sample.found for sample in of_body if sample.part and sample.found is not None]
         say(f"{body}: {len(of_body)} samples" + (f", part found in {np.mean(found):.0%}" if found else ""))
     output.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(output)
+    _sheet(rows).save(output)
     report = {
         "conditions": {"folder": str(folder), "seed": seed, "steps": steps, "scale": scale, "closeups": closeups},
         **summary(judged),
@@ -149,6 +149,16 @@ def evaluate_parts(
     }
     write_atomically(output.with_suffix(".json"), (json.dumps(report, indent=1) + "\n").encode())
     return report
+
+
+def _sheet(rows: Sequence[Sequence[np.ndarray]]) -> Image.Image:
+    """The rows below each other, short ones filled with black: not every part finds a place on every body."""
+    longest = max(len(row) for row in rows)
+    return Image.fromarray(
+        np.concatenate(
+            [np.concatenate([*row, *[np.zeros_like(row[0])] * (longest - len(row))], axis=1) for row in rows]
+        )
+    )
 
 
 def judge_sample(
