@@ -49,10 +49,8 @@ def main() -> None:
             rendered = time.process_time()
             guides = views.after.guides(camera, options.size, 1, box)
             rows = {"grain": (grainy, rendered - start)}
-            for quick in (False, True):
-                before = time.process_time()
-                clean = denoised(grainy, *guides, quick=quick)
-                rows["quick" if quick else "clean"] = (clean, time.process_time() - before + rendered - start)
+            before = time.process_time()
+            rows["clean"] = (denoised(grainy, *guides), time.process_time() - before + rendered - start)
             seconds = rows["clean"][1]
             more = max(spp, round(spp * seconds / max(rows["grain"][1], 1e-6)))
             rows["same seconds"] = (views.after.radiance(camera, options.size, more, 2, box), seconds)

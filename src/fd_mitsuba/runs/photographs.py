@@ -55,11 +55,11 @@ def write_photographs(
     size, turn_size = output.picture_size, min(output.picture_size, _TURN_SIZE)
     views = PhotoViews.of(scene, folder, turn_size)
     frames = [
-        views.shown(views.after.photograph(camera, turn_size, _TURN_SPP, seed=2, quick=True))
+        views.shown(views.after.photograph(camera, turn_size, _TURN_SPP, seed=2))
         for camera in views.around(output.turntable_frames)
     ]
     images = {
-        "beauty_base": views.shown(views.before.photograph(views.camera, size, _SPP // 2, quick=True)),
+        "beauty_base": views.shown(views.before.photograph(views.camera, size, _SPP // 2)),
         "beauty": views.shown(views.after.photograph(views.camera, size, _SPP)),
         "closeup": views.shown(views.after.photograph(views.close, size, _SPP, seed=1)),
     }

@@ -73,16 +73,15 @@ class PhotoSet:
         scene = mi.load_dict({"type": "scene", **shapes, **lights, "ground": paper}, optimize=False)
         return cls(mi, scene, frame, named)
 
-    def photograph(self, camera: CameraBatch, size: int, spp: int, seed: int = 0, quick: bool = False) -> np.ndarray:
+    def photograph(self, camera: CameraBatch, size: int, spp: int, seed: int = 0) -> np.ndarray:
         """The linear image (size, size, 3) that the first camera sees, without grain where there is a denoiser.
 
         Args:
             spp: samples a pixel; several times as many without a denoiser.
-            quick: half the denoiser's time for a little of its detail, as for the frames of a film.
         """
         if not has_denoiser():
             return self.radiance(camera, size, spp * _WITHOUT_DENOISER, seed)
-        return denoised(self.radiance(camera, size, spp, seed), *self.guides(camera, size, seed), quick)
+        return denoised(self.radiance(camera, size, spp, seed), *self.guides(camera, size, seed))
 
     def radiance(
         self, camera: CameraBatch, size: int, spp: int, seed: int = 0, box: tuple[slice, slice] | None = None
