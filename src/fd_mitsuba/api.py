@@ -74,6 +74,8 @@ def import_asset(
         front: the axis that it looks along, such as "-y"; None: likewise.
         units: "mm", "cm" or "m"; None: as the format says.
         at: places of focal regions; see `scene.region_words`; none: where the prompted part usually is, else its head.
+            A prompt of several parts puts each where it usually is, or at as many places in their order, and gives each
+            a prompt of its own.
         size: of the regions: a share of the longest side such as "0.3", or "12u" in the asset's unit; None: what the
             prompted part usually has there, see `scene.usual_regions`, else 0.3.
         light: an EXR environment map; None: a shipped one.
@@ -90,15 +92,15 @@ def import_asset(
         run = fd.edit(fd.load_scene(imported.scene), output="runs/duck")
     """
     from fd_mitsuba.assets.importing import import_file
-    from fd_mitsuba.guidance.prompted_part import prompted_part
+    from fd_mitsuba.guidance.prompted_part import prompted_parts
 
     for name, text in (("prompt", prompt), ("base_prompt", base_prompt)):
         if text is not None and not text.strip():
             raise UserError(f"{name}: is blank; describe the object")
     told = [None if text is None else " ".join(text.split()) for text in (prompt, base_prompt)]
     lit = _LIGHT if light is None else Path(light)
-    part = prompted_part(told[0], told[1] or "", removed=subtract)
-    return import_file(Path(path), Path(folder), lit, told[0], told[1], up, front, units, at, size, subtract, part)
+    how = up, front, units, at, size, subtract, prompted_parts(told[0], told[1] or "", subtract)
+    return import_file(Path(path), Path(folder), lit, told[0], told[1], *how)
 
 
 def load_scene(
@@ -150,7 +152,7 @@ def load_scene(
         from fd_mitsuba.scene.load_scene import load_edit_scene
 
         if at:
-            regions = _placed(Path(path), dict(parameters or {}), regions, at, size, subtract)
+            regions = _placed(Path(path), dict(parameters or {}), regions, at, size, subtract, words)
         elif size is not None:
             raise UserError(f"size {size}: is that of regions to place; say where they go, too")
         elif subtract:
@@ -165,14 +167,19 @@ def _placed(
     at: Sequence[str],
     size: str | None,
     subtract: bool,
+    prompt: str | None,
 ) -> Path:
     """A file of regions at places, which is gone with this process."""
     from fd_mitsuba.assets.placing import write_placed_regions
+    from fd_mitsuba.guidance.prompted_part import prompted_parts
+    from fd_mitsuba.scene.load_scene import scene_prompt
 
     if regions is not None:
         raise UserError(f"{regions}: regions come from a file or from places to put them; give one of the two")
     target = temporary_folder() / "regions.xml"
-    write_placed_regions(scene, parameters, at, size, target, subtract)
+    # A scene without any prompt says so when it is loaded.
+    wanted = prompted_parts(prompt or scene_prompt(scene, parameters), removed=subtract)
+    write_placed_regions(scene, parameters, at, size, target, subtract, wanted)
     return target
 
 

@@ -41,8 +41,8 @@ def test_an_edit_as_an_instruction() -> None:
 
 def test_the_other_methods_are_guided_at_every_step(scene: EditScene, tmp_path: Path) -> None:
     given = task(scene, tmp_path)
-    assert GeometryStage(scene, given.config, given.guidance).draft is not None  # type: ignore[arg-type]
-    assert given.own.draft is None
+    assert GeometryStage(scene, given.config, given.guidance).drafts is not None  # type: ignore[arg-type]
+    assert given.own.drafts is None
 
 
 def test_the_built_in_prior_edits_views_and_inpaints_regions(scene: EditScene, tmp_path: Path) -> None:

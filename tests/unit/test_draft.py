@@ -92,7 +92,7 @@ def test_the_views_are_close_and_all_around() -> None:
 def test_a_stage_drafts_first_and_is_guided_then(scene: EditScene) -> None:
     guidance, free = DrawingGuidance(), {"lambda_focal": 0.0, "lambda_collision": 0.0}
     stage = GeometryStage(scene, settings(steps=20, draft_fraction=0.2, **free), guidance)
-    stage.draft.begin(stage.field)
+    stage.drafts.begin(stage.field)
     before = stage.check_field(0)["volume_ratio"]
     records = [stage.step(step).values for step in range(4)]
     drafted = stage.check_field(4)["volume_ratio"]
@@ -107,14 +107,14 @@ def test_a_stage_drafts_first_and_is_guided_then(scene: EditScene) -> None:
 def test_the_field_begins_as_the_hull_within_the_regions(scene: EditScene) -> None:
     """Everything in the middle half of all pictures, which are 1.4 times as wide as the regions."""
     stage = GeometryStage(scene, settings(), DrawingGuidance())
-    error = stage.draft.begin(stage.field)
-    hull = stage.draft.hull[stage.extractor.active_index]
+    error = stage.drafts.begin(stage.field)
+    hull = stage.drafts.parts[0].hull[stage.extractor.active_index]
     sdf, region = stage.extractor.part_sdf(stage.field), stage.region_sdf[stage.extractor.active_index]
     deep = hull.abs() > stage.grid.spacing
     assert error < 0.3 and ((sdf > 0) == (hull > 0))[deep].float().mean() > 0.97
     assert not (hull > region).any() and (hull > 0).sum() < 0.9 * (region > 0).sum()
     positions = stage.grid.vertices[stage.extractor.active_index][hull > 0].numpy()
-    assert np.linalg.norm(positions - stage.focus[0], axis=1).max() < 1.1 * 1.4 * stage.focus[1] / 2 * np.sqrt(3)
+    assert np.linalg.norm(positions - stage.foci[0][0], axis=1).max() < 1.1 * 1.4 * stage.foci[0][1] / 2 * np.sqrt(3)
 
 
 NOTHING, TOP, BOTTOM = slice(0, 0), slice(4, 12), slice(20, 28)
@@ -126,7 +126,7 @@ def test_where_no_one_part_is_drawn_every_step_is_guided_as_if_nothing_was(
 ) -> None:
     guidance = DrawingGuidance(*rows)
     stage = GeometryStage(scene, settings(), guidance)
-    assert stage.draft.begin(stage.field) is None and not stage.draft.leads
+    assert stage.drafts.begin(stage.field) is None and not stage.drafts.lead
     plain = GeometryStage(scene, settings(draft_fraction=0.0), DrawingGuidance())
     assert np.array_equal(stage.cameras(0)[0].azimuth_deg, plain.cameras(0)[0].azimuth_deg)  # not always the same ones
     stage.step(0), plain.step(0)
@@ -137,7 +137,7 @@ def test_where_no_one_part_is_drawn_every_step_is_guided_as_if_nothing_was(
 
 def test_several_pictures_a_step_and_a_share_of_the_views(scene: EditScene) -> None:
     guidance = DrawingGuidance()
-    draft = GeometryStage(scene, settings(views=8), guidance).draft
+    draft = GeometryStage(scene, settings(views=8), guidance).drafts.parts[0]
     draft.guide(torch.zeros(8, 5, 24, 24), 0)
     draft.guide(torch.zeros(4, 5, 24, 24), 4)  # the second of two processes
     assert guidance.drafter.followed == [slice(0, 2), slice(1, 2)]
@@ -145,12 +145,12 @@ def test_several_pictures_a_step_and_a_share_of_the_views(scene: EditScene) -> N
 
 def test_without_a_drafter_and_for_cuts_nothing_is_drafted(scene: EditScene) -> None:
     for guidance, share in ((DrawingGuidance(), 0.0), (None, 0.4)):
-        assert GeometryStage(scene, settings(draft_fraction=share), guidance).draft is None
+        assert GeometryStage(scene, settings(draft_fraction=share), guidance).drafts is None
     blind = DrawingGuidance()
     blind.drafter = None
     stage = GeometryStage(scene, settings(), blind)
     stage.step(0)
-    assert stage.draft is None and blind.drafted == [False]
+    assert stage.drafts is None and blind.drafted == [False]
 
 
 def test_seeds_draw_others_parts(scene: EditScene) -> None:
@@ -184,3 +184,44 @@ def test_a_run_resumed_among_drafted_steps_ends_the_same(scene: EditScene, tmp_p
     run_stage(again, tmp_path / "killed", resume=True, quiet=True, say=lambda line: None)
     for one, other in zip(whole.field.parameters(), again.field.parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+HAT_AND_TAIL = "".join(
+    f'<shape type="focal_region" id="{name}"><string name="part" value="{name}"/><transform name="to_world">'
+    f'<scale value="0.25"/><translate y="{y}" z="{z}"/></transform></shape>'
+    for name, y, z in (("hat", 0.55, 0.5), ("tail", 0.1, -0.6))
+)
+
+
+def test_parts_are_drafted_and_looked_at_in_turn(make_scene: Callable[..., Path]) -> None:
+    scene = load_edit_scene(make_scene(region=HAT_AND_TAIL))
+    guidance = DrawingGuidance()
+    config = settings(steps=6, draft_fraction=0.7)
+    config = config.model_copy(update={"cameras": config.cameras.model_copy(update={"focus_fraction": 1.0})})
+    stage = GeometryStage(scene, config, guidance)
+    centres = [region.to_canonical[:3, 3] for region in scene.regions]
+    for step in range(6):  # four that are drafted, two that are guided
+        cameras, closeup = stage.cameras(step)
+        assert closeup and np.abs(cameras.target - centres[step % 2]).max() < 1.5 * stage.grid.spacing
+    assert stage.drafts.begin(stage.field) < 0.3
+    (_, first), (_, second) = guidance.drafter.drawn_for
+    assert first != second
+    sdf = stage.extractor.part_sdf(stage.field)
+    points = stage.grid.vertices[stage.extractor.active_index][sdf > 0].numpy()
+    held = [np.linalg.norm(points - centre, axis=1) < 0.3 * scene.frame.scale for centre in centres]
+    assert held[0].any() and held[1].any() and (held[0] | held[1]).all()
+    guidance.drafter.rows = (NOTHING,)
+    for step in range(6):
+        stage.step(step)
+    assert guidance.steps == [4, 5]
+
+
+def test_a_part_of_which_nothing_is_drawn_is_guided_from_the_first_step(make_scene: Callable[..., Path]) -> None:
+    scene = load_edit_scene(make_scene(region=HAT_AND_TAIL))
+    guidance = DrawingGuidance()
+    stage = GeometryStage(scene, settings(steps=4, draft_fraction=1.0), guidance)
+    assert stage.drafts.parts[0].leads
+    guidance.drafter.rows = (NOTHING,)
+    for step in range(4):
+        stage.step(step)
+    assert guidance.steps == [1, 3] and guidance.drafted == [True, True]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import fd_mitsuba as fd
-from fd_mitsuba.assets.placing import placed_regions
+from fd_mitsuba.assets.placing import placed_regions, prompted_regions
 from fd_mitsuba.cli.main import main
 from fd_mitsuba.guidance.builtin import WIDE_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
-from fd_mitsuba.guidance.prompted_part import prompted_part
+from fd_mitsuba.guidance.prompted_part import prompted_part, prompted_parts
 from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.parts import PARTS
 from fd_mitsuba.scene.region_words import ObjectPlaces
@@ -99,3 +99,46 @@ def test_a_scene_says_its_prompt_itself(capsys: pytest.CaptureFixture[str]) -> N
 )
 def test_the_one_part_of_a_prompt(prompt: str | None, part: str | None) -> None:
     assert prompted_part(prompt) == part
+
+
+PAIR = "a duck with a shiny golden crown and a blue cape"
+
+
+def test_several_parts_are_put_apart_each_with_its_own_words(tmp_path: Path) -> None:
+    made = fd.import_asset(ASSETS / "duck.stl", tmp_path / "duck", prompt=PAIR)
+    scene = fd.load_scene(made.scene)
+    assert list(scene.parts) == ["crown", "cape"] and scene.base_prompt == "a duck"
+    assert {part: own.prompt for part, own in scene.part_prompts.items()} == {
+        "crown": "a duck with a shiny golden crown",
+        "cape": "a duck with a blue cape",
+    }
+    alone = [
+        fd.load_scene(fd.import_asset(ASSETS / "duck.stl", tmp_path / word, prompt=f"a duck with a {word}").scene)
+        for word in ("crown", "cape")
+    ]
+    for region, other in zip(scene.regions, alone, strict=True):  # in a frame that has room for both
+        to_user = scene.frame.matrix() @ np.linalg.inv(other.frame.matrix())
+        assert np.allclose(region.to_canonical, to_user @ other.regions[0].to_canonical, atol=1e-5)
+
+
+def test_several_parts_at_as_many_places_and_at_others() -> None:
+    body = BODIES["bear"](np.random.default_rng(0))
+    places = ObjectPlaces(body.solid.vertices, body.solid.faces)
+    put, about = prompted_regions(places, prompted_parts(PAIR), ["left side", "head"], None, subtract=False)
+    assert [region.name for region in put] == ["crown", "cape"] and about[0].startswith("crown at left_side: ")
+    assert np.allclose(put[0].centre, placed_regions(places, ["left side"], None, part="crown")[0][0].centre)
+    together, _ = prompted_regions(places, prompted_parts(PAIR), ["top"], None, subtract=False)
+    assert [(region.name, region.part, region.prompt) for region in together] == [("top", None, None)]
+    cut, _ = prompted_regions(
+        places, prompted_parts("a bear without a crown and a cape", removed=True), [], None, subtract=True
+    )
+    assert len(cut) == 1 and cut[0].subtracts
+
+
+def test_places_that_python_names_fit_the_prompt_too() -> None:
+    scene = fd.load_scene(SCENES / "cat" / "scene.xml", prompt="a cat with wings", at=["back"])
+    tail = fd.load_scene(SCENES / "cat" / "scene.xml", prompt="a cat with a tail", at=["back"])
+    wide, round_ = (np.linalg.norm(s.regions[0].to_canonical[:3, :3], axis=0) for s in (scene, tail))
+    assert wide.max() > 2.5 * wide.min() and np.ptp(round_) < 1e-6  # a tail is not usual there
+    both = fd.load_scene(SCENES / "cat" / "scene.xml", prompt="a cat with wings and a crown", at=["back", "head"])
+    assert list(both.parts) == ["wings", "crown"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fd_mitsuba.assets.orientation import find_orientation, read_axis
-from fd_mitsuba.assets.placing import placed_regions
+from fd_mitsuba.assets.placing import prompted_regions
 from fd_mitsuba.assets.readers import read_asset
 from fd_mitsuba.assets.scene_writer import SceneText, write_scene
 from fd_mitsuba.assets.shapes import SceneShape, scene_shapes
@@ -21,7 +21,7 @@ from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_stack import UNITS
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-from fd_mitsuba.scene.usual_regions import usual_place
+from fd_mitsuba.scene.usual_regions import PromptedParts, usual_place
 
 _MANY_SHAPES = 64
 
@@ -70,13 +70,13 @@ def import_file(
     at: Sequence[str] = (),
     size: str | None = None,
     subtract: bool = False,
-    part: str | None = None,
+    asked: PromptedParts | None = None,
 ) -> ImportedAsset:
     """Write a scene to edit; see `api.import_asset`.
 
     Args:
         light: the EXR that lights it.
-        part: that the prompt asks for, as `guidance.prompted_part` names it.
+        asked: what the prompt asks for; None: nothing is known of it.
 
     Raises:
         UserError: an asset that cannot be read or edited, options that are wrong, a folder with something in it.
@@ -96,12 +96,12 @@ def import_file(
     orientation = find_orientation(vertices, faces, suffix, (asset.up, asset.front), (wanted[0], wanted[1]))
     to_scene = orientation.matrix()
     places = ObjectPlaces(vertices @ to_scene[:3, :3].T, faces)
-    usual = usual_place(part)
-    regions, about = placed_regions(places, at or (usual,), size, subtract, part)
+    asked = asked or PromptedParts()
+    regions, about = prompted_regions(places, asked, at, size, subtract)
     words = _words(path)
     text = SceneText(
         prompt=prompt or words,
-        base_prompt=base_prompt or _before_the_part(prompt) or words,
+        base_prompt=base_prompt or asked.body or words,
         light=light,
         comment=f"Made of {path.name} by fd_mitsuba import.",
         unit=units or asset.unit,
@@ -110,7 +110,10 @@ def import_file(
     if len(shapes) > _MANY_SHAPES:
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
-    if not at:
+    if not at and len(regions) > 1:
+        remarks.append("puts each part where such a part usually is; an --at for each, in their order, says otherwise")
+    elif not at:
+        usual = usual_place(asked.only)
         where = "on its head" if usual == "head" else f"at {places.find(usual).about}"
         remarks.append(f"puts the region {where}; --at says otherwise: top, back, 'left side', x,y,z and the like")
     if prompt is None:
@@ -155,9 +158,3 @@ def _words(path: Path) -> str:
     words = [word for word in re.split(r"[\W_]+", text) if word and not word.isdigit()]
     name = " ".join(words).lower() or "thing"
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
-
-
-def _before_the_part(prompt: str | None) -> str | None:
-    """The words of a prompt before "with" and the like, which name the object itself."""
-    found = re.match(r"(.+?)\s+(?:with|wearing|carrying|holding|that has|which has)\s", prompt or "", re.IGNORECASE)
-    return found[1] if found else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,7 +16,7 @@ from fd_mitsuba.scene.load_scene import load_base
 from fd_mitsuba.scene.plugins import DUAL_PATH
 from fd_mitsuba.scene.region_size import region_size
 from fd_mitsuba.scene.region_words import ObjectPlaces, PlacedRegion
-from fd_mitsuba.scene.usual_regions import region_for, usual_region
+from fd_mitsuba.scene.usual_regions import PromptedParts, region_for, usual_place, usual_region
 
 
 def placed_regions(
@@ -50,6 +51,34 @@ def placed_regions(
     return regions, about
 
 
+def prompted_regions(
+    places: ObjectPlaces, asked: PromptedParts, at: Sequence[str], size: str | None, subtract: bool
+) -> tuple[list[PlacedRegion], list[str]]:
+    """Regions for what a prompt asks for, and a sentence about each.
+
+    One part gets all the places. Several get one each, in their order, with a prompt of its own; where there are
+    more or fewer places than parts, they grow as one.
+
+    Args:
+        at: as the words of `--at`; empty: where each part usually is, or takes off something.
+        size: of all; None: of each its usual one, else a share of the object.
+        subtract: whether what they hold is cut out of the base.
+
+    Raises:
+        UserError: a place or a size that is not known.
+    """
+    if subtract or not asked.alone or len(at) not in (0, len(asked.alone)):
+        return placed_regions(places, at or (usual_place(asked.only),), size, subtract, asked.only)
+    regions, about = [], []
+    for number, (part, alone) in enumerate(asked.alone.items()):
+        place = at[number] if at else usual_place(part)
+        (region,), (said,) = placed_regions(places, [place], size, part=part)
+        name = part.replace(" ", "_")
+        regions.append(replace(region, name=name, part=name, prompt=alone))
+        about.append(f"{name} at {said}")
+    return regions, about
+
+
 def write_placed_regions(
     scene: Path,
     parameters: Mapping[str, str],
@@ -57,12 +86,13 @@ def write_placed_regions(
     size: str | None,
     target: Path,
     subtract: bool = False,
-    part: str | None = None,
+    asked: PromptedParts | None = None,
 ) -> list[str]:
     """Write regions at places of a scene's base to `target`, an XML file for `--regions`; a sentence about each.
 
     Args:
-        at, size, subtract, part: as in `placed_regions`.
+        at, size, subtract: as in `prompted_regions`.
+        asked: what the prompt asks for; None: nothing is known of it.
 
     Raises:
         UserError: a scene that cannot be read, a place or a size that is not known.
@@ -71,7 +101,7 @@ def write_placed_regions(
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in base[:-1]])
     vertices = np.concatenate([mesh.vertices for mesh in base])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(base, starts, strict=True)])
-    regions, about = placed_regions(ObjectPlaces(vertices, faces), at, size, subtract, part)
+    regions, about = prompted_regions(ObjectPlaces(vertices, faces), asked or PromptedParts(), at, size, subtract)
     root = ElementTree.Element("scene", version="3.0.0")
     integrator = ElementTree.SubElement(root, "integrator", type=DUAL_PATH)
     ElementTree.SubElement(integrator, "boolean", name="only_these_regions", value="true")

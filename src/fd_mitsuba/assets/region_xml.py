@@ -13,6 +13,9 @@ from fd_mitsuba.scene.region_words import PlacedRegion
 def region_element(region: PlacedRegion) -> ElementTree.Element:
     """The `<shape type="focal_region">`, with a scale, a rotation and a translation."""
     element = ElementTree.Element("shape", type="focal_region", id=region.name)
+    for name, value in (("part", region.part), ("prompt", region.prompt)):
+        if value is not None:
+            ElementTree.SubElement(element, "string", name=name, value=value.replace("$", r"\$"))
     if region.subtracts:
         ElementTree.SubElement(element, "string", name="mode", value=SUBTRACT)
     transform = ElementTree.SubElement(element, "transform", name="to_world")

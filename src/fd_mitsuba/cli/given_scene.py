@@ -49,7 +49,7 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
         raise UserError("--at and --regions: give one of the two")
     from fd_mitsuba.api import temporary_folder
     from fd_mitsuba.assets.placing import write_placed_regions
-    from fd_mitsuba.guidance.prompted_part import prompted_part
+    from fd_mitsuba.guidance.prompted_part import prompted_parts
     from fd_mitsuba.scene.load_scene import scene_prompt
 
     folder = temporary_folder() if beside is None else beside.parent
@@ -57,8 +57,8 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
     told = definitions(options)
     # A scene without any prompt says so when it is loaded.
     told_prompt = options.prompt or scene_prompt(Path(options.scene), told)
-    part = prompted_part(told_prompt, removed=options.subtract)
-    how = options.at, options.size, target, options.subtract, part
+    wanted = prompted_parts(told_prompt, removed=options.subtract)
+    how = options.at, options.size, target, options.subtract, wanted
     about = write_placed_regions(Path(options.scene), told, *how)
     for line in about:
         say(f"region {line}; in place of the scene's own")

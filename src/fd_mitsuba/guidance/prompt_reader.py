@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fd_mitsuba.guidance.caption_writer import CaptionWriter
 from fd_mitsuba.guidance.lexicon import lexicon
@@ -37,6 +37,7 @@ class PromptReading:
     ignored: its words that the model is not told.
     nearest: known part phrases that are spelt most like the prompt's words, best first.
     doubtful: whether it says no to a no, or both wants and does not want the same part.
+    phrases: of each of `parts`, the prompt's own words for it: "a golden crown".
     """
 
     parts: tuple[str, ...]
@@ -49,6 +50,7 @@ class PromptReading:
     ignored: tuple[str, ...]
     nearest: tuple[str, ...]
     doubtful: bool = False
+    phrases: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
         """One line: "part: pointed hat; body: rabbit; ignored: cuddly"."""
@@ -124,6 +126,7 @@ def read_prompt(prompt: str, vocabulary: Vocabulary, base_prompt: str = "") -> P
             and not (group.taken_away or group.first in negated)
             for group in named
         ),
+        phrases={group.entry.name: _own_words(group, tokens, vocabulary) for group in wanted},
     )
 
 
@@ -131,6 +134,14 @@ def known_text(text: str, vocabulary: Vocabulary) -> str:
     """The text without the words that the vocabulary lacks: for prompts that say what to keep away from."""
     known = vocabulary.known_words()
     return " ".join(token.text for token in tokens_of(text) if token.text in known)
+
+
+def _own_words(group: Group, tokens: Sequence[Token], vocabulary: Vocabulary) -> str:
+    """What the prompt says of a part, what it is made of included; a phrase of the model's for "winged"."""
+    if group.entry.kind != "part":
+        return vocabulary.parts[group.entry.name][0]
+    said = tokens[group.begin : group.end]
+    return " ".join(token.text + "'s" * token.owner for token in said)
 
 
 def _body_within(parts: Sequence[Group], vocabulary: Vocabulary) -> str | None:

@@ -63,7 +63,8 @@ class Place:
 class PlacedRegion:
     """An ellipsoid: the unit sphere scaled by `half_axes`, turned by `rotation` (3, 3), moved to `centre`.
 
-    With `subtracts` its part is cut out of the base.
+    With `subtracts` its part is cut out of the base. `part` and `prompt`, where there are any, are the part that it
+    belongs to and what that is to be, for a scene of several parts.
     """
 
     name: str
@@ -71,6 +72,8 @@ class PlacedRegion:
     half_axes: np.ndarray
     rotation: np.ndarray
     subtracts: bool = False
+    part: str | None = None
+    prompt: str | None = None
 
     def to_world(self) -> np.ndarray:
         """(4, 4) from the unit sphere."""

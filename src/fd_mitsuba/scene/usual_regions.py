@@ -7,7 +7,7 @@ bodies; what is worn on a head is measured by the head's width, all else by the 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -79,7 +79,22 @@ USUAL_REGIONS: Mapping[str, UsualRegion] = {
     "skateboard": _on("bottom", (0.33, 0.24, 0.63), 0.03),
     "boots": _on("bottom", (0.3, 0.26, 0.4), -0.1),
 }  # fmt: skip
-"""By the names of `guidance.prompted_part`."""
+"""By the names of parts that the built-in priors' vocabulary has."""
+
+
+@dataclass(frozen=True)
+class PromptedParts:
+    """What a prompt asks for, as far as regions are concerned; see `guidance.prompted_part`.
+
+    Attributes:
+        only: name of the one part; None: none that is known, or several.
+        alone: of several parts, by name and in the prompt's order, a prompt for each; else empty.
+        body: what the prompt calls the object itself; None: it does not say.
+    """
+
+    only: str | None = None
+    alone: Mapping[str, str] = field(default_factory=dict)
+    body: str | None = None
 
 
 def usual_region(part: str | None, place: Place) -> UsualRegion | None:

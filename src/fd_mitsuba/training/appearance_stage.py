@@ -35,7 +35,7 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
 from fd_mitsuba.training.descent import adamw, descend, fade
-from fd_mitsuba.training.region_masks import RegionMasks
+from fd_mitsuba.training.region_masks import RegionMasks, shown_first
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
@@ -96,7 +96,7 @@ class AppearanceStage:
             scene, self.parts, self.shading, size, settings.spp, settings.max_depth, settings.single_path, opened
         )
         corners = np.concatenate([np.asarray(mesh.vertices) for mesh in self.parts.values()])
-        self.focus = bounding_ball(corners)
+        self.foci = [bounding_ball(np.asarray(mesh.vertices)) for mesh in self.parts.values()]
         self.aim = centre_of_box(np.concatenate([scene.base_canonical.vertices, corners]))
         self.exposure = settings.exposure or self._exposure()
         self._points = points_on(self.parts.values(), _POOL, seed_for(config.seed, Purpose.STYLE))
@@ -108,10 +108,10 @@ class AppearanceStage:
         return self.name
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
-        """The step's views, and whether they are close-ups of the part."""
+        """The step's views, and whether they are close-ups of a part, of each in turn."""
         seed = seed_for(self.config.seed, Purpose.APPEARANCE_VIEWS, step)
         count = self.config.appearance.views
-        return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
+        return step_views(self.config.cameras, count, seed, self.foci[step % len(self.foci)], self.aim, self.guidance)
 
     def texture(self, gbuffer: GBuffer) -> TextureValues:
         """What the field says at the points that are seen, with gradients."""
@@ -155,7 +155,7 @@ class AppearanceStage:
                 azimuth_deg=cameras.azimuth_deg,
                 elevation_deg=cameras.elevation_deg,
                 closeup=closeup,
-                regions=self._region_masks(cameras, step, share.start),
+                regions=shown_first(self._region_masks(cameras, step, share.start), gbuffer),
                 share=share,
                 control=self._control(gbuffer),
             )

@@ -2,14 +2,14 @@
 
 Image gradients move surfaces, and cannot make one where there is none: a region that shrinks onto antlers passes them
 by. So the field begins as the visual hull of what was drawn (`fields.visual_hull`), and the first steps follow the
-pictures themselves, always from the same close views, all around the focal regions. Pictures of one mosaic are of one
-part; those of several mosaics are of several. Views and pictures follow from the settings and the run's seed, so that a
-resumed run goes on with the same ones. Not in the paper.
+pictures themselves, always from the same close views, all around the part's focal regions; those of several parts in
+turn. Pictures of one mosaic are of one part; those of several mosaics are of several. Views and pictures follow from
+the settings and the run's seed, so that a resumed run goes on with the same ones. Not in the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -43,12 +43,12 @@ ShowBase = Callable[[CameraBatch], GuidanceViews]
 
 @dataclass(frozen=True)
 class Place:
-    """Where a part may be drafted.
+    """Where one part may be drafted.
 
     Attributes:
         base: canonical.
         extractor: of the part's field.
-        region_sdf: (count,) to the focal regions, at the grid's vertices.
+        region_sdf: (count,) to the part's focal regions, at the grid's vertices.
         focus: centre and radius of what the pictures show, canonical.
     """
 
@@ -59,11 +59,10 @@ class Place:
 
 
 class Draft:
-    """What is drawn, and the way towards it.
+    """What is drawn of one part, and the way towards it.
 
     Args:
-        steps: how many of the first steps follow the pictures.
-        cameras: of each of these steps, and of the pictures.
+        cameras: of the pictures, and of each step that follows them.
         mosaic: consecutive cameras of a picture.
         drafter: draws.
         place: where.
@@ -72,42 +71,14 @@ class Draft:
     """
 
     def __init__(
-        self,
-        steps: int,
-        cameras: CameraBatch,
-        mosaic: int,
-        drafter: Drafter,
-        place: Place,
-        show_base: ShowBase,
-        seed: int,
+        self, cameras: CameraBatch, mosaic: int, drafter: Drafter, place: Place, show_base: ShowBase, seed: int
     ) -> None:
-        self.steps, self.cameras = steps, cameras
-        self._mosaic, self._drafter, self._place = mosaic, drafter, place
-        self._show_base, self._seed = show_base, seed
-
-    @classmethod
-    def planned(
-        cls, config: RunConfig, guidance: Guidance | None, coarse_steps: int, place: Place, show_base: ShowBase
-    ) -> Draft | None:
-        """The draft that the settings ask for; None: none, or a guidance that draws no shapes.
-
-        Args:
-            coarse_steps: of the run.
-        """
-        steps, drafter = round(config.geometry.draft_fraction * coarse_steps), getattr(guidance, "drafter", None)
-        if steps == 0 or drafter is None:
-            return None
-        mosaic = views_at_once(guidance)
-        cameras = draft_views(config.cameras, config.geometry.views, mosaic, place.focus)
-        return cls(steps, cameras, mosaic, drafter, place, show_base, seed_for(config.seed, Purpose.DRAFT))
-
-    def has(self, step: int) -> bool:
-        """Whether the step follows the pictures."""
-        return step < self.steps and self.leads
+        self.cameras, self.place = cameras, place
+        self._mosaic, self._drafter, self._show_base, self._seed = mosaic, drafter, show_base, seed
 
     @property
     def leads(self) -> bool:
-        """Whether what was drawn is one part in the regions, and so to be followed; else all steps are guided."""
+        """Whether what was drawn is one part in the regions, and so to be followed."""
         return self.hull is not None
 
     @cached_property
@@ -121,7 +92,7 @@ class Draft:
 
         None where that is next to nothing, or little of what was drawn: elsewhere, or in several places at once.
         """
-        place, grid = self._place, self._place.extractor.grid
+        place, grid = self.place, self.place.extractor.grid
         points, room = grid.vertices.numpy(), (place.region_sdf > 0).numpy()
         coverage = self.drawn.part.numpy()
         views = point_views(place.base.vertices, place.base.faces, self.cameras, coverage.shape[-1], points[room])
@@ -134,15 +105,6 @@ class Draft:
         worth = explained(coverage, views.film, shown) >= _LEAST_EXPLAINED
         return hull if worth and int((hull > 0).sum()) >= _LEAST_VERTICES else None
 
-    def begin(self, field: PartField) -> float | None:
-        """Fit the field to the hull; returns the mean error in cells, or None where there is no hull."""
-        if self.hull is None:
-            return None
-        extractor, grid = self._place.extractor, self._place.extractor.grid
-        near = torch.nonzero(self._place.region_sdf > -_AROUND_CELLS * grid.spacing).flatten()
-        start, target = extractor.initial_sdf[near], self.hull[near]
-        return fit_field(field, grid.vertices[near], start, target, grid.spacing, self._seed)
-
     def guide(self, pictures: Tensor, first: int) -> GuidanceResult:
         """The loss of a step that follows the pictures.
 
@@ -152,6 +114,67 @@ class Draft:
         """
         begin = first // self._mosaic
         return self._drafter.guide(pictures, self.drawn, slice(begin, begin + len(pictures) // self._mosaic))
+
+
+class Drafts:
+    """The drafts of a scene's parts, which the first steps follow in turn.
+
+    Args:
+        steps: how many of the first steps.
+        parts: at least one.
+        seed: of the field's fit.
+    """
+
+    def __init__(self, steps: int, parts: Sequence[Draft], seed: int) -> None:
+        self.steps, self.parts, self._seed = steps, tuple(parts), seed
+
+    @classmethod
+    def planned(
+        cls,
+        config: RunConfig,
+        guidance: Guidance | None,
+        coarse_steps: int,
+        places: Sequence[Place],
+        show_base: ShowBase,
+    ) -> Drafts | None:
+        """The drafts that the settings ask for; None: none, or a guidance that draws no shapes.
+
+        Args:
+            coarse_steps: of the run.
+            places: of each part.
+        """
+        steps, drafter = round(config.geometry.draft_fraction * coarse_steps), getattr(guidance, "drafter", None)
+        if steps == 0 or drafter is None:
+            return None
+        mosaic, drafts = views_at_once(guidance), []
+        for number, place in enumerate(places):
+            cameras = draft_views(config.cameras, config.geometry.views, mosaic, place.focus)
+            seed = seed_for(config.seed, Purpose.DRAFT, number)
+            drafts.append(Draft(cameras, mosaic, drafter, place, show_base, seed))
+        return cls(steps, drafts, seed_for(config.seed, Purpose.DRAFT))
+
+    @property
+    def lead(self) -> bool:
+        """Whether any of them is to be followed; else all steps are guided."""
+        return any(part.leads for part in self.parts)
+
+    def of(self, step: int) -> Draft | None:
+        """The one that the step follows; None: it is guided."""
+        part = self.parts[step % len(self.parts)]
+        return part if step < self.steps and part.leads else None
+
+    def begin(self, field: PartField) -> float | None:
+        """Fit the field to the hulls, and to the regions of a part without one; returns the mean error in cells, None
+        where no part has a hull.
+        """
+        if not self.lead:
+            return None
+        extractor = self.parts[0].place.extractor
+        grid, regions = extractor.grid, torch.stack([part.place.region_sdf for part in self.parts]).amax(0)
+        hulls = [part.place.region_sdf if part.hull is None else part.hull for part in self.parts]
+        near = torch.nonzero(regions > -_AROUND_CELLS * grid.spacing).flatten()
+        start, target = extractor.initial_sdf[near], torch.stack(hulls).amax(0)[near]
+        return fit_field(field, grid.vertices[near], start, target, grid.spacing, self._seed)
 
 
 def draft_views(settings: CamerasConfig, count: int, together: int, focus: tuple[np.ndarray, float]) -> CameraBatch:

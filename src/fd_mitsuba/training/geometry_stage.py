@@ -32,7 +32,7 @@ from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.framing import bounding_ball, centre_of_box
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.descent import adamw, descend, fade
-from fd_mitsuba.training.draft import Draft, Place
+from fd_mitsuba.training.draft import Draft, Drafts, Place
 from fd_mitsuba.training.field_losses import FieldLosses, asked_depth
 from fd_mitsuba.training.region_masks import RegionMasks
 from fd_mitsuba.training.seeds import Purpose, seed_for
@@ -88,14 +88,16 @@ class GeometryStage:
         self.field = PartField(config.field, seed_for(config.seed, Purpose.FIELD))
         self.optimiser = adamw(self.field, geometry)
         self.average = WeightAverage(self.field, geometry.average) if geometry.average > 0 else None
-        self.focus = bounding_ball(points[(self.region_sdf > 0).numpy()])
+        own = [regions[[region.part == name for region in scene.regions]].amax(dim=0) for name in scene.parts]
+        own = [sdf for sdf in own if bool((sdf > 0).any())]
+        self.foci = [bounding_ball(points[(sdf > 0).numpy()]) for sdf in own]
         self.aim = centre_of_box(np.concatenate([base.vertices, points[(self.region_sdf > 0).numpy()]]))
         self._passes: dict[Phase, GeometryPass] = {}
         self._base_passes: dict[Phase, GeometryPass] = {}
         self._region_masks = RegionMasks(scene, config, guidance)
-        place = Place(base, self.extractor, self.region_sdf, self.focus)
-        planned = Draft.planned(config, guidance, self.coarse_steps, place, self._views_of_base)
-        self.draft = None if scene.subtracts else planned
+        places = [Place(base, self.extractor, sdf, focus) for sdf, focus in zip(own, self.foci, strict=True)]
+        planned = Drafts.planned(config, guidance, self.coarse_steps, places, self._views_of_base)
+        self.drafts = None if scene.subtracts else planned
         self.counters = {INVISIBLE: 0}
         """Whole numbers that steps hand on to later ones; a checkpoint keeps them."""
 
@@ -121,12 +123,12 @@ class GeometryStage:
         return self.phase_of(step)[0]
 
     def cameras(self, step: int) -> tuple[CameraBatch, bool]:
-        """The step's views, and whether they are close-ups of the focal regions."""
-        if self.draft is not None and self.draft.has(step):
-            return self.draft.cameras, True
+        """The step's views, and whether they are close-ups of a part's focal regions, of each in turn."""
+        if (draft := self._draft(step)) is not None:
+            return draft.cameras, True
         seed = seed_for(self.config.seed, Purpose.VIEWS, step)
         count = self.config.geometry.views
-        return step_views(self.config.cameras, count, seed, self.focus, self.aim, self.guidance)
+        return step_views(self.config.cameras, count, seed, self.foci[step % len(self.foci)], self.aim, self.guidance)
 
     @property
     def final_field(self) -> PartField:
@@ -166,8 +168,8 @@ class GeometryStage:
         geometry = self.config.geometry
         phase = self.phase_of(step)[0]
         cameras, closeup = self.cameras(step)
-        if self.draft is not None and step == 0:
-            self.draft.begin(self.field)
+        if self.drafts is not None and step == 0:
+            self.drafts.begin(self.field)
         asked = self.field_losses.ask(step)
         surface = self.extractor(self.field, asked.samples if asked is not None else None)
         losses: dict[str, Tensor] = {}
@@ -206,12 +208,12 @@ class GeometryStage:
         assert self.guidance is not None
         phase, phase_step, phase_length = self.phase_of(step)
         first = 0 if share is None else share.start
-        if self.draft is not None and self.draft.has(step):
-            return self.draft.guide(pictures, first)
+        if (draft := self._draft(step)) is not None:
+            return draft.guide(pictures, first)
         base = self._render_base(cameras, phase, step, first) if self.guidance.needs_base else None
         regions = self._region_masks(cameras, step, first)
         angles = cameras.azimuth_deg, cameras.elevation_deg
-        drafted = self.draft is not None and self.draft.leads
+        drafted = self.drafts is not None and self.drafts.lead
         views = GuidanceViews(pictures, base, *angles, closeup, regions, share, drafted)
         seed = seed_for(self.config.seed, Purpose.GUIDANCE, step)
         return self.guidance.guide(views, phase_step, phase_length, phase, seed)
@@ -285,6 +287,10 @@ class GeometryStage:
             self.grid, self.sdf_base, self.start_sdf, active, geometry.union_k, geometry.union_only_outside,
             depth=asked_depth(geometry, self.grid, self.scene.subtracts),
         )  # fmt: skip
+
+    def _draft(self, step: int) -> Draft | None:
+        """That which the step follows; None: it is guided."""
+        return None if self.drafts is None else self.drafts.of(step)
 
     def _variety(self) -> float:
         """0 for seed 0, which starts from the regions themselves, and where nothing guides and a start would stay."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.region_views import RegionViews
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.views import CameraBatch
@@ -35,3 +39,23 @@ class RegionMasks:
         if self._views is None:
             self._views = RegionViews(self._scene.parts, size, self._config.geometry.focal_band)
         return self._views.render(cameras, seed_for(self._config.seed, Purpose.REGIONS, step) + first)
+
+
+def shown_first(masks: Mapping[str, Tensor], seen: GBuffer) -> dict[str, Tensor]:
+    """Masks of regions in which a pixel that shows a part counts for that part, whatever region is before it.
+
+    The region of a pair of wings hides a crown from behind, and the wings themselves do not.
+
+    Args:
+        masks: part -> (B, 1, R, R), in the order of the G-buffer's parts.
+        seen: what the same views show.
+    """
+    if len(masks) < 2:
+        return dict(masks)
+    views, _, size, _ = seen.alpha.shape
+    shown = torch.zeros(len(masks), views * size * size)
+    shown[seen.part, seen.pixel] = (seen.part_mask.flatten()[seen.pixel] > 0).float()
+    side = next(iter(masks.values())).shape[-1]
+    shares = adaptive_avg_pool2d(shown.reshape(len(masks), views, size, size), side)[:, :, None]
+    free = 1 - shares.sum(0)
+    return {name: own + free * mask for (name, mask), own in zip(masks.items(), shares, strict=True)}
