@@ -29,8 +29,8 @@ from prior_pairs import Case, chosen_cases  # noqa: E402
 
 from fd_mitsuba.config import RunConfig  # noqa: E402
 from fd_mitsuba.errors import UserError  # noqa: E402
+from fd_mitsuba.evaluation.before_and_after import judged_views  # noqa: E402
 from fd_mitsuba.evaluation.part_judge import PartJudge, load_judge  # noqa: E402
-from fd_mitsuba.evaluation.verdict import judged_views  # noqa: E402
 from fd_mitsuba.io.json_object import write_json  # noqa: E402
 from fd_mitsuba.prior.data.bodies import BODIES  # noqa: E402
 from fd_mitsuba.prior.data.parts import PARTS  # noqa: E402

@@ -30,8 +30,8 @@ import trimesh  # noqa: E402
 from prior_pairs import CASES, Case, chosen_cases, regions_xml  # noqa: E402
 
 from fd_mitsuba.errors import UserError  # noqa: E402
+from fd_mitsuba.evaluation.before_and_after import judged_views  # noqa: E402
 from fd_mitsuba.evaluation.part_judge import LEAST_PIXELS, PartJudge, changed_pixels, load_judge  # noqa: E402
-from fd_mitsuba.evaluation.verdict import judged_views  # noqa: E402
 from fd_mitsuba.io.json_object import write_json  # noqa: E402
 from fd_mitsuba.prior.data.fine.bodies import BODIES  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402

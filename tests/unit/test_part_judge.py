@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.evaluation.before_and_after import judged_views
 from fd_mitsuba.evaluation.part_judge import (
     CAMERA_RADIUS,
     CLASSES_NAME,
@@ -26,7 +27,6 @@ from fd_mitsuba.evaluation.part_judge import (
     load_judge,
     save_judge,
 )
-from fd_mitsuba.evaluation.verdict import judged_views
 from fd_mitsuba.guidance.builtin import builtin_folder, write_hashes
 from fd_mitsuba.guidance.mosaic import tile_views
 from fd_mitsuba.prior.data.bodies import BODIES

@@ -9,13 +9,14 @@ import pytest
 import torch
 
 from fd_mitsuba.evaluation.part_judge import PartClassifier, load_judge
-from fd_mitsuba.evaluation.verdict import LIKE, NOTHING, SURE, Verdict, judge_part, part_shares
+from fd_mitsuba.evaluation.verdict import LIKE, NOTHING, SURE, Verdict, Verdicts, judge_part, part_shares
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.parts import PARTS
 from fd_mitsuba.prior.data.primitives import Solid, join
 from fd_mitsuba.prior.data.starts import starts_like
 from fd_mitsuba.prior.pictures.part_corpus import UNSEEN_SEED, lumps_of
+from fd_mitsuba.scene.focal_region import PartPrompt
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,43 @@ def test_a_start_that_stayed_lumps_and_a_part_that_vanished_do_not(judge: PartCl
     assert not lumps.sure and lumps.share < 0.7
     gone = judge_part(stage_of(body, part, prompt, "nothing"), judge, words)
     assert not gone.looks_like and gone.shares[NOTHING] == 1.0 and "no view shows it" in gone.line()
+
+
+def test_each_of_several_parts_is_judged_as_if_the_others_had_been_there(judge: PartClassifier) -> None:
+    rng = np.random.default_rng(UNSEEN_SEED)
+    made = BODIES["dog"](rng)
+    true = {"hat": PARTS["pointed hat"](made, rng), "board": PARTS["skateboard"](made, rng)}
+    begun = {name: starts_like(part, rng) for name, part in true.items()}
+    words, body = vocabulary_of("builtin"), made.solid
+
+    def balls(part: Solid) -> tuple[SimpleNamespace]:
+        centre = (part.vertices.min(0) + part.vertices.max(0)) / 2
+        return (SimpleNamespace(sdf=lambda points: -np.linalg.norm(points - centre, axis=1)),)
+
+    def said(**prompts: str) -> dict[str, Verdict]:
+        scene = SimpleNamespace(
+            prompt="a dog with a pointed hat on a skateboard",
+            base_prompt="a dog",
+            parts={name: balls(part) for name, part in true.items()},
+            part_prompts={name: PartPrompt(prompt) for name, prompt in prompts.items()},
+        )
+        stage = SimpleNamespace(
+            scene=scene,
+            aim=np.zeros(3),
+            surface=lambda: surface(body, join(list(true.values()))),
+            start_surface=lambda: surface(body, join(list(begun.values()))),
+            base_surface=surface(body, None),
+        )
+        assert judge_part(stage, judge, words) is None  # by the prompt of both
+        return {name: judge_part(stage, judge, words, of=name) for name in prompts}
+
+    right = said(hat="a dog with a pointed hat", board="a dog on a skateboard")
+    assert right["hat"].looks_like and right["board"].looks_like
+    wrong = said(hat="a dog on a skateboard", board="a dog with a pointed hat")
+    assert not wrong["hat"].looks_like and not wrong["board"].looks_like
+    both = Verdicts({"hat": right["hat"], "board": wrong["board"]})
+    assert both.score == wrong["board"].score and not both.to_json()["looks_like"]
+    assert both.line() == f"hat {right['hat'].line()}; board {wrong['board'].line()}"
 
 
 def test_only_prompts_in_the_words_of_the_judge_are_judged(judge: PartClassifier) -> None:

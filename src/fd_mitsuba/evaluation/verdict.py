@@ -6,50 +6,41 @@ over rings of views of the whole object and close-ups of the part, restricted to
 and "nothing", and scaled to a sum of 1. Only views that show the part count. What the base has by itself (a cat's tail)
 says nothing, since the judge sees each view before and after; a bare region or a lump is "nothing" to it. Bat wings
 count for a prompt that asks for wings, and a top hat for one that asks for a hat, not the other way round. And the
-prompt's part must be clearly likelier than it was at the start: a region like a wing that stayed is no wing.
+prompt's part must be clearly likelier than it was at the start: a region like a wing that stayed is no wing. Of several
+parts, each with a prompt of its own, each is judged by itself: the others are there before, too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.errors import UserError
+from fd_mitsuba.evaluation.before_and_after import before_and_after
 from fd_mitsuba.evaluation.part_judge import (
-    CAMERA_RADIUS,
     JUDGE_FOLDER,
     LEAST_PIXELS,
-    VIEW_SIZE,
     PartJudge,
     changed_pixels,
     load_judge,
 )
 from fd_mitsuba.evaluation.part_judge import NOTHING as JUDGED_NOTHING
-from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import Vocabulary
-from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.runs.scene_model import model_for_scene
 from fd_mitsuba.scene.edit_scene import EditScene
-from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.geometry_stage import GeometryStage
 
 NOTHING = "nothing"
 LIKE, SURE = 0.5, 0.8
 """Least share of the prompt's part for "looks like", and for a verdict that ends a series of tries."""
 JUDGE_NAME = "built-in judge of parts"
-_VIEWS_A_RING, _ELEVATIONS_DEG, _SPP = 8, (15.0, 40.0), 16
-_HALF_WIDTH = 1.25
-"""Of a view of the whole object, canonical units; in the middle of what the judge was trained on."""
-_CLOSE, _LEAST_HALF_WIDTH = 1.5, 0.3
-"""Half width of a close-up, in radii of the part, and at least so wide; both as in the judge's training."""
 _LEAST_GAIN = 1.0
 """By how much the part's log odds must exceed those of the start."""
 _SHOWN = 3
@@ -123,19 +114,45 @@ class Verdict:
         }
 
 
+@dataclass(frozen=True)
+class Verdicts:
+    """One on each of several parts, by the parts' names in the scene."""
+
+    of_parts: dict[str, Verdict]
+
+    @property
+    def score(self) -> float:
+        """Of the worst of them."""
+        return min(verdict.score for verdict in self.of_parts.values())
+
+    def line(self) -> str:
+        """One line for people: "crown looks like: crown .91; wings looks like: wings .80"."""
+        return "; ".join(f"{part} {verdict.line()}" for part, verdict in self.of_parts.items())
+
+    def to_json(self) -> dict:
+        """What `metrics.json` holds."""
+        return {
+            "looks_like": all(verdict.looks_like for verdict in self.of_parts.values()),
+            "score": round(self.score, 4),
+            "line": self.line(),
+            "parts": {part: verdict.to_json() for part, verdict in self.of_parts.items()},
+        }
+
+
 def judge_part(
-    stage: GeometryStage, judge: PartJudge, vocabulary: Vocabulary, name: str = JUDGE_NAME
+    stage: GeometryStage, judge: PartJudge, vocabulary: Vocabulary, name: str = JUDGE_NAME, of: str | None = None
 ) -> Verdict | None:
     """The verdict on a finished geometry stage; None where the prompt does not ask for one part that the judge knows.
 
     Args:
         vocabulary: the words in which the prompt is read, and the parts that it could have asked for.
+        of: one of the scene's parts, which has a prompt of its own; None: all that grew, by the scene's prompt.
     """
-    wanted = _wanted(stage.scene, vocabulary)
+    wanted = _wanted(stage.scene, vocabulary, of)
     parts = [part for part in vocabulary.parts if part in judge.classes]
     if wanted not in parts:
         return None
-    edited, start = (list(_pairs(stage, surface)) for surface in (stage.surface(), stage.start_surface()))
+    edited, start = (list(before_and_after(stage, surface, of)) for surface in (stage.surface(), stage.start_surface()))
     (said, views), (begun, _) = (part_shares(judge, parts, pictures) for pictures in (edited, start))
     shares, before = (_with_kinds(dict(zip((*parts, NOTHING), found, strict=True)), wanted) for found in (said, begun))
     ranked = sorted(shares.items(), key=lambda item: -item[1])
@@ -155,21 +172,25 @@ def _with_kinds(shares: dict[str, float], wanted: str) -> dict[str, float]:
 
 def can_be_judged(scene: EditScene, config: RunConfig) -> bool:
     """Whether the built-in judge can say if a run looks like its prompt: the prompt guides the shape, and asks for one
-    part, in the judge's words, to be added.
+    part, in the judge's words, to be added, or has such a prompt for each of several.
     """
     vocabulary, judged = _words(model_for_scene(config, scene)[0]), vocabulary_of(BUILTIN_WIDE)
     if config.geometry.lambda_sds == 0 or scene.subtracts or vocabulary is None or judged is None:
         return False
-    return _wanted(scene, vocabulary) in judged.parts
+    return all(_wanted(scene, vocabulary, of) in judged.parts for of in _judged_apart(scene) or [None])
 
 
-def judge_run(geometry: GeometryStage, say: Callable[[str], None]) -> Verdict | None:
+def judge_run(geometry: GeometryStage, say: Callable[[str], None]) -> Verdict | Verdicts | None:
     """What the built-in judge says of a finished shape; None where it cannot be asked."""
     vocabulary = _words(geometry.config)
     if vocabulary is None or not can_be_judged(geometry.scene, geometry.config):
         return None
     try:
-        return judge_part(geometry, load_judge(JUDGE_FOLDER), vocabulary)
+        judge, apart = load_judge(JUDGE_FOLDER), _judged_apart(geometry.scene)
+        if not apart:
+            return judge_part(geometry, judge, vocabulary)
+        found = {part: judge_part(geometry, judge, vocabulary, of=part) for part in apart}
+        return Verdicts({part: verdict for part, verdict in found.items() if verdict is not None})
     except UserError as error:
         say(f"no verdict on the part: {error}")
         return None
@@ -203,44 +224,16 @@ def _words(config: RunConfig) -> Vocabulary | None:
     return vocabulary_of(config.guidance.model) or vocabulary_of(BUILTIN_WIDE)
 
 
-def _wanted(scene: EditScene, vocabulary: Vocabulary) -> str | None:
-    parts = read_prompt(scene.prompt, vocabulary, scene.base_prompt).parts
+def _judged_apart(scene: EditScene) -> list[str]:
+    """The parts of a scene of several, where all have a prompt of their own; else none."""
+    names = list(scene.parts)
+    return names if len(names) > 1 and set(names) == set(scene.part_prompts) else []
+
+
+def _wanted(scene: EditScene, vocabulary: Vocabulary, of: str | None = None) -> str | None:
+    prompt = scene.prompt if of is None else scene.part_prompts[of].prompt
+    parts = read_prompt(prompt, vocabulary, scene.base_prompt).parts
     return parts[0] if len(parts) == 1 else None
-
-
-@torch.no_grad()
-def _pairs(stage: GeometryStage, surface: UnionSurface) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Views of the base and of a surface with a part: rings around the whole, then close-ups around the part."""
-    part = surface.vertices[surface.part_weight > 0.5].double().numpy()
-    frames = [(elevation, stage.aim, _HALF_WIDTH) for elevation in _ELEVATIONS_DEG]
-    if len(part):
-        low, high = part.min(0), part.max(0)
-        half = np.clip(_CLOSE * np.linalg.norm(high - low) / 2, _LEAST_HALF_WIDTH, _HALF_WIDTH)
-        frames.append((25.0, (low + high) / 2, float(half)))
-    for elevation, target, half in frames:
-        base, whole = (
-            judged_views(which.vertices, which.faces, target, elevation, half)
-            for which in (stage.base_surface, surface)
-        )
-        yield base, whole
-
-
-def judged_views(
-    vertices: torch.Tensor, faces: torch.Tensor, target: np.ndarray, elevation_deg: float, half_width: float
-) -> np.ndarray:
-    """A ring of views (8, 4, 32, 32) of a mesh as `PartJudge` takes them, the first from the front.
-
-    Args:
-        vertices, faces: (V, 3) canonical, (F, 3).
-        target: (3,) what the cameras look at, canonical.
-        half_width: of the view at the target, canonical units.
-    """
-    fov = 2 * np.degrees(np.arctan(half_width / CAMERA_RADIUS))
-    turn = np.arange(_VIEWS_A_RING) * (360.0 / _VIEWS_A_RING)
-    cameras = CameraBatch.around(turn, elevation_deg, CAMERA_RADIUS, fov, np.tile(target, (len(turn), 1)))
-    rendering, weight = GeometryPass(VIEW_SIZE, _SPP, 0), torch.zeros(len(vertices))
-    pictures = rendering.render_primal(vertices.float(), faces, weight, cameras, seed=0).numpy()
-    return np.concatenate([pictures[:, :3], 2 * pictures[:, 3:4] - 1], axis=1)
 
 
 def _log_odds(share: float) -> float:
