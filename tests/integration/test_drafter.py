@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.evaluation.part_judge import load_judge
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.guidance.drafter import TOLERANCE
+from fd_mitsuba.guidance.drafter import TOLERANCE, DiffusionDrafter
 from fd_mitsuba.guidance.interface import Drawn, GuidanceViews
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.load_scene import load_edit_scene
@@ -51,6 +52,19 @@ def test_it_draws_what_the_prompt_says(guidance: DiffusionGuidance, views: Guida
     said = judge(before, after)
     named = [judge.classes[k] for k in said.argmax(1)]
     assert named.count("pointed hat") >= 5, named
+
+
+def test_without_a_scale_of_its_own_the_text_says_nothing(guidance: DiffusionGuidance, views: GuidanceViews) -> None:
+    drawn = {}
+    for scale in (0.0, 3.0):
+        for prompt in ("a snowman with a pointed hat", "a snowman with wings"):
+            other = copy.copy(guidance)
+            other.conventions = guidance.conventions.model_copy(update={"draft_scale": scale})
+            other.set_prompt(prompt)
+            drawn[scale, prompt] = DiffusionDrafter(other).draw(views, 3).latents
+    guidance.set_prompt("a snowman with a pointed hat")
+    (same, twin), (hat, wings) = (list(drawn.values())[k : k + 2] for k in (0, 2))
+    assert torch.equal(same, twin) and (hat - wings).abs().mean() > 0.01
 
 
 def test_the_seed_decides_what_is_drawn(guidance: DiffusionGuidance, views: GuidanceViews) -> None:

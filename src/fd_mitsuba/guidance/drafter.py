@@ -28,8 +28,8 @@ from fd_mitsuba.guidance.query import Distillation, Query, guidance_coefficients
 if TYPE_CHECKING:
     from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 
-STEPS, SCALE = 6, 3.0
-"""Of DDIM, and of classifier-free guidance; with twice as many steps a judge of parts is as sure."""
+STEPS = 6
+"""Of DDIM; with twice as many a judge of parts is as sure."""
 TOLERANCE = 0.15
 """What a copy of the base is off by in some channel, see `prior.judging.evaluate.KEPT_WITHIN`."""
 
@@ -57,7 +57,7 @@ class DiffusionDrafter:
             raise ValueError("the base's pictures are what the model draws on")
         images = tile_views(views.base, guidance.view_grid).to(guidance.device)
         base = guidance.encode(images, "coarse")
-        scales = SCALE, guidance.config.image_guidance_scale
+        scales = guidance.conventions.draft_scale, guidance.config.image_guidance_scale
         how = Distillation(guidance.variant, guidance.config.weighting, *scales, timestep_range=(0.0, 1.0))
         passes = tuple(guidance_coefficients(how, has_image_pass=True))
         texts = guidance.embeddings(guidance.prompts(views), passes)

@@ -51,6 +51,8 @@ class ModelConventions(BaseModel):
     """The tokenizer knows whole words only, so that a word it must split is one the model never saw."""
     vocabulary: Vocabulary | None = None
     """The words that the model knows, if they can be listed; a prompt that asks for no known part is refused."""
+    draft_scale: Annotated[float, Field(ge=0)] = 3.0
+    """Classifier-free guidance of the text where a part is drafted; a model that is less sure wants less."""
     about: dict[str, Any] = {}
     """Free remarks (training data, licence); not read."""
 
