@@ -55,7 +55,7 @@ def import_asset(
     up: str | None = None,
     front: str | None = None,
     units: str | None = None,
-    at: Sequence[str] = (),
+    at: Sequence[str] | str = (),
     size: str | None = None,
     light: Path | str | None = None,
     subtract: bool = False,
@@ -94,6 +94,7 @@ def import_asset(
     from fd_mitsuba.assets.importing import import_file
     from fd_mitsuba.guidance.prompted_part import prompted_parts
 
+    at = [at] if isinstance(at, str) else at
     for name, text in (("prompt", prompt), ("base_prompt", base_prompt)):
         if text is not None and not text.strip():
             raise UserError(f"{name}: is blank; describe the object")
@@ -113,7 +114,7 @@ def load_scene(
     variant: str = DEFAULT_VARIANT,
     on_misplaced: Callable[[UserError], None] | None = None,
     plugins: Collection[str] = (),
-    at: Sequence[str] = (),
+    at: Sequence[str] | str = (),
     size: str | None = None,
     needs_region: bool = True,
     subtract: bool = False,
@@ -140,6 +141,7 @@ def load_scene(
     Raises:
         UserError: whatever is wrong with the scene, in one line with file, element and remedy.
     """
+    at = [at] if isinstance(at, str) else at
     words = None if prompt is None else one_line_of(prompt)
     if words == "":
         raise UserError("prompt: is blank; describe the edited object")

@@ -10,11 +10,15 @@ import pytest
 import fd_mitsuba as fd
 from fd_mitsuba.assets.placing import placed_regions, prompted_regions
 from fd_mitsuba.cli.main import main
+from fd_mitsuba.config import RunConfig
 from fd_mitsuba.guidance.builtin import WIDE_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
+from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
+from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.prompted_part import prompted_part, prompted_parts
 from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.parts import PARTS
+from fd_mitsuba.runs.prompt_fit import prompt_warnings
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.usual_regions import USUAL_REGIONS, usual_place
 
@@ -112,6 +116,7 @@ def test_several_parts_are_put_apart_each_with_its_own_words(tmp_path: Path) -> 
         "crown": "a duck with a shiny golden crown",
         "cape": "a duck with a blue cape",
     }
+    assert scene.prompt_of("cape") == "a duck with a blue cape" and scene.prompt == PAIR
     alone = [
         fd.load_scene(fd.import_asset(ASSETS / "duck.stl", tmp_path / word, prompt=f"a duck with a {word}").scene)
         for word in ("crown", "cape")
@@ -129,10 +134,6 @@ def test_several_parts_at_as_many_places_and_at_others() -> None:
     assert np.allclose(put[0].centre, placed_regions(places, ["left side"], None, part="crown")[0][0].centre)
     together, _ = prompted_regions(places, prompted_parts(PAIR), ["top"], None, subtract=False)
     assert [(region.name, region.part, region.prompt) for region in together] == [("top", None, None)]
-    cut, _ = prompted_regions(
-        places, prompted_parts("a bear without a crown and a cape", removed=True), [], None, subtract=True
-    )
-    assert len(cut) == 1 and cut[0].subtracts
 
 
 def test_places_that_python_names_fit_the_prompt_too() -> None:
@@ -142,3 +143,62 @@ def test_places_that_python_names_fit_the_prompt_too() -> None:
     assert wide.max() > 2.5 * wide.min() and np.ptp(round_) < 1e-6  # a tail is not usual there
     both = fd.load_scene(SCENES / "cat" / "scene.xml", prompt="a cat with wings and a crown", at=["back", "head"])
     assert list(both.parts) == ["wings", "crown"]
+
+
+def test_what_a_base_has_already_and_what_is_not_wanted_get_no_region() -> None:
+    assert prompted_parts("a cow with horns and a crown", "a cow with horns").only == "crown"
+    asked = prompted_parts("a cow without horns and with a crown and wings")
+    assert asked.body == "a cow" and list(asked.alone.values()) == ["a cow with a crown", "a cow with wings"]
+    assert prompted_parts("put a crown on the cow").body == "a cow"
+    assert prompted_parts("a man on a skateboard wearing a cape").alone["cape"] == "a person with a cape"
+    long = prompted_parts("a duck with a very long, black crown and a cape").alone["crown"]
+    assert "," not in long and read_prompt(long, vocabulary_of("builtin")).parts == ("crown",)
+
+
+def test_two_parts_to_take_off_get_a_region_each() -> None:
+    body = BODIES["cow"](np.random.default_rng(0))
+    places = ObjectPlaces(body.solid.vertices, body.solid.faces)
+    asked = prompted_parts("a cow without horns and a tail", removed=True)
+    cut, about = prompted_regions(places, asked, [], None, subtract=True)
+    assert [(one.name, one.prompt, one.subtracts) for one in cut] == [
+        ("horns", "a cow without horns", True),
+        ("tail", "a cow without a tail", True),
+    ]
+    assert np.allclose(cut[1].centre, placed_regions(places, ["rear"], None, subtract=True)[0][0].centre)
+    assert all(line.endswith("subtracts") for line in about)
+
+
+def test_a_place_may_be_one_word_in_python(tmp_path: Path) -> None:
+    scene = fd.load_scene(SCENES / "cat" / "scene.xml", at="back")
+    assert scene.regions[0].name == "back"
+    made = fd.import_asset(ASSETS / "duck.stl", tmp_path / "duck", prompt=PAIR, at="head")
+    assert made.regions[0].endswith("; crown, cape grow as one there: an --at for each puts them apart")
+
+
+def test_misfits_of_prompt_and_regions_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = fd.import_asset(ASSETS / "duck.stl", tmp_path / "duck", prompt=PAIR).scene
+    quick = RunConfig.load("quick")
+    assert prompt_warnings(fd.load_scene(scene), quick) == []
+    (other,) = prompt_warnings(fd.load_scene(scene, prompt="a duck with a top hat"), quick)
+    assert "speaks of top hat" in other and "of cape, crown: say --at" in other
+    cat = SCENES / "cat" / "scene.xml"
+    (mixed,) = prompt_warnings(fd.load_scene(cat, prompt="a cat with wings and a crown"), quick)
+    assert "crown, wings, and all regions are of one part" in mixed
+    hats = fd.load_scene(cat, prompt="a cat with a crown and a hat", at=["head", "head"])
+    (shared,) = prompt_warnings(hats, quick)
+    assert shared.startswith("parts crown and hat: their regions share a place")
+    unguided = quick.model_copy(update={"geometry": quick.geometry.model_copy(update={"lambda_sds": 0.0})})
+    assert prompt_warnings(hats, unguided) == []
+    assert main(["check", str(scene), "--prompt", "a duck with a top hat"]) == 0
+    assert "warning  the prompt speaks of top hat" in capsys.readouterr().out
+
+
+def test_the_scene_of_a_run_is_not_replaced_by_a_refused_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["run", str(ASSETS / "duck.stl"), "-c", "smoke", "--stage", "geometry", "-q", "-o", str(tmp_path / "run")]
+    assert main([*run, "--prompt", "a duck with a crown", "--set", "geometry.steps=1"]) == 0
+    before = (tmp_path / "run.scene" / "scene.xml").read_bytes()
+    assert main([*run, "--prompt", "a duck with wings", "--resume"]) != 0
+    assert "holds a run already, of another import or another prompt" in capsys.readouterr().err
+    assert (tmp_path / "run.scene" / "scene.xml").read_bytes() == before

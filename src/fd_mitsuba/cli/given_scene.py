@@ -67,6 +67,7 @@ def prepare_scene(options: argparse.Namespace, beside: Path | None, say: Callabl
 
 def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[str], None]) -> Path:
     from fd_mitsuba.api import import_asset, temporary_folder
+    from fd_mitsuba.runs.run_folder import TRIES_RECORD
 
     asset = Path(options.scene)
     if options.regions is not None and options.at:
@@ -85,6 +86,11 @@ def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[s
     before = read_json_object(folder / _RECORD)
     if before is not None and {key: before.get(key) for key in record} == json.loads(json.dumps(record)):
         return folder / "scene.xml"
+    if beside is not None and any((beside / name).is_file() for name in ("run.json", TRIES_RECORD)):
+        raise UserError(
+            f"{beside}: holds a run already, of another import or another prompt; choose another -o folder, or give "
+            "the options of that run"
+        )
     if before is not None and set(before.get("files") or []) >= {path.name for path in folder.iterdir()}:
         shutil.rmtree(folder)  # made by an import of something else, and by nobody else
     imported = import_asset(asset, folder, **wanted)

@@ -219,7 +219,7 @@ def gltf_meshes(content: ExportContent, pivot: bool = False) -> list[GltfMesh]:
     for part in content.parts:
         mesh = part.mesh
         tangents = vertex_tangents(mesh.vertices, mesh.faces, mesh.normals, mesh.uv)
-        about = {**content.extras, "part": part.name}
+        about = {**content.extras, "part": part.name, "prompt": content.scene.prompt_of(part.name)}
         place = _joint(content.scene, mesh.vertices, mesh.faces) if pivot else origin
         placed = np.eye(4)
         placed[:3, 3] = place

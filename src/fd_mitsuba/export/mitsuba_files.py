@@ -113,7 +113,7 @@ def _stack(
             found.append(
                 StackedPart(
                     name,
-                    scene.prompt,
+                    scene.prompt_of(name),
                     latest,
                     len(part.mesh.faces),
                     names[0],

@@ -140,7 +140,7 @@ def _own_words(group: Group, tokens: Sequence[Token], vocabulary: Vocabulary) ->
     """What the prompt says of a part, what it is made of included; a phrase of the model's for "winged"."""
     if group.entry.kind != "part":
         return vocabulary.parts[group.entry.name][0]
-    said = tokens[group.begin : group.end]
+    said = [token for token in tokens[group.begin : group.end] if not token.is_stop]
     return " ".join(token.text + "'s" * token.owner for token in said)
 
 

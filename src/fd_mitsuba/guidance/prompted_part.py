@@ -7,6 +7,7 @@ import re
 from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
+from fd_mitsuba.guidance.vocabulary import WITHOUT
 from fd_mitsuba.scene.usual_regions import PromptedParts
 
 
@@ -26,7 +27,8 @@ def prompted_parts(prompt: str | None, base_prompt: str = "", removed: bool = Fa
     """All of the parts by their usual names; of several, a prompt for each alone, in the prompt's own words.
 
     Args:
-        removed: the part that it wants off.
+        base_prompt: what it says of the object now; the parts in it are there already.
+        removed: the parts that it wants off.
 
     >>> prompted_parts("a duck with a golden crown and a cape").alone
     {'crown': 'a duck with a golden crown', 'cape': 'a duck with a cape'}
@@ -34,15 +36,23 @@ def prompted_parts(prompt: str | None, base_prompt: str = "", removed: bool = Fa
     vocabulary = vocabulary_of(BUILTIN_WIDE) if prompt else None
     if vocabulary is None:
         return PromptedParts(body=_first_words(prompt))
+
+    def bare(text: str | None) -> str | None:
+        """What names the object and no part: not "a man on a skateboard", not "a cow without horns and"."""
+        found = read_prompt(text, vocabulary) if text else None
+        return None if found is None or found.parts or found.removed or _first_words(text) else text
+
     reading = read_prompt(prompt or "", vocabulary, base_prompt)
-    parts, body = reading.removed if removed else reading.parts, _first_words(prompt)
-    if body is None or read_prompt(body, vocabulary).parts:  # "put a crown on it", "a man on a skateboard wearing ..."
-        body = f"a {vocabulary.bodies[reading.bodies[0]][0]}" if reading.bodies else None
-    if len(parts) == 1:
-        return PromptedParts(parts[0], body=body)
-    whole = base_prompt or body or "an object"
-    alone = {} if removed else {name: f"{whole} with {words}" for name, words in reading.phrases.items()}
-    return PromptedParts(alone=alone if len(alone) > 1 else {}, body=body)
+    noun = f"a {vocabulary.bodies[reading.bodies[0]][0]}" if reading.bodies else None
+    body = bare(_first_words(prompt)) or noun
+    there = read_prompt(base_prompt, vocabulary).parts if base_prompt and not removed else ()
+    named = reading.removed if removed else reading.parts
+    parts = [name for name in named if name in vocabulary.parts and name not in there]
+    if len(parts) < 2:
+        return PromptedParts(next(iter(parts), None), body=body)
+    whole, link = bare(base_prompt) or body or "an object", WITHOUT if removed else "with"
+    phrases = {name: vocabulary.parts[name][0] if removed else reading.phrases[name] for name in parts}
+    return PromptedParts(alone={name: f"{whole} {link} {words}" for name, words in phrases.items()}, body=body)
 
 
 def _first_words(prompt: str | None) -> str | None:

@@ -16,6 +16,7 @@ from fd_mitsuba.runs.check_report import BaseCheck, CheckReport, RegionCheck
 from fd_mitsuba.runs.choices import checked_choices
 from fd_mitsuba.runs.cost import estimate_cost
 from fd_mitsuba.runs.model_check import check_model
+from fd_mitsuba.runs.prompt_fit import prompt_warnings
 from fd_mitsuba.runs.scene_model import model_for_scene
 from fd_mitsuba.scene.appearance_inputs import check_appearance_inputs, check_shading
 from fd_mitsuba.scene.base_appearance import base_shapes
@@ -69,6 +70,7 @@ def check_scene(scene: EditScene, config: RunConfig) -> CheckReport:
             + _base_warnings(base)
             + _region_warnings(regions, config)
             + _scene_warnings(scene, config)
+            + prompt_warnings(scene, config)
             + ([cost.memory_warning] if cost.memory_warning else [])
         ),
         prompt_reading=reading,

@@ -49,6 +49,7 @@ from fd_mitsuba.runs.levels import checked_levels, level_folder, remove_other_le
 from fd_mitsuba.runs.network_size import network_size
 from fd_mitsuba.runs.outcome_warnings import outcome_warnings
 from fd_mitsuba.runs.photographs import write_photographs
+from fd_mitsuba.runs.prompt_fit import prompt_warnings
 from fd_mitsuba.runs.run_folder import check_folder, describe_run, discarded_without_checkpoint, refuse_strange_folder
 from fd_mitsuba.runs.run_lock import run_lock
 from fd_mitsuba.runs.saved_run import saved_run
@@ -118,7 +119,8 @@ def run(
         config = checked_choices(config)
         if guidance is None:
             config, chosen = model_for_run(config, scene, folder)
-            opening = [*opening, *([chosen] if chosen else [])]
+            warnings = [f"warning: {line}" for line in prompt_warnings(scene, config)]
+            opening = [*opening, *([chosen] if chosen else []), *warnings]
         refuse_hidden_parts(scene.path, scene.regions, scene.base_canonical)
         if guidance is not None:
             refuse_guidance_alone(guidance)

@@ -80,6 +80,11 @@ class EditScene:
         """Part name -> its own prompt, of the parts that have one."""
         return part_prompts(self.regions)
 
+    def prompt_of(self, part: str) -> str:
+        """What a part is to be: its own prompt, or the scene's."""
+        own = self.part_prompts.get(part)
+        return self.prompt if own is None else own.prompt
+
     @property
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
