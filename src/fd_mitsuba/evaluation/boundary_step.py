@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import torch
 
 from fd_mitsuba.fields.texture import TextureField
+from fd_mitsuba.fields.textures_apart import TexturesApart
 from fd_mitsuba.render.appearance_scene import Triangles
 from fd_mitsuba.render.tonemap import to_srgb
 from fd_mitsuba.scene.base_appearance import BaseAppearance
@@ -18,7 +19,7 @@ _POINTS = 16384
 
 @torch.no_grad()
 def boundary_step(
-    scene: EditScene, parts: Iterable[Triangles], field: TextureField, reach: float, seed: int = 0
+    scene: EditScene, parts: Iterable[Triangles], field: TextureField | TexturesApart, reach: float, seed: int = 0
 ) -> float | None:
     """Mean over the part's points near the base of `|kd_part(x) - kd_base(nearest)|`, the root mean square of channels.
 

@@ -22,6 +22,7 @@ from fd_mitsuba.export.assets import PartAsset, chosen_exporters, export_assets
 from fd_mitsuba.export.final_surface.final_part import FinalPart, final_parts
 from fd_mitsuba.export.part_record import part_record
 from fd_mitsuba.fields.texture import TextureField
+from fd_mitsuba.fields.textures_apart import TexturesApart
 from fd_mitsuba.guidance.interface import Guidance
 from fd_mitsuba.io.json_object import write_json
 from fd_mitsuba.runs.appearance_outcome import (
@@ -250,7 +251,7 @@ def export_run(
 def write_assets(
     geometry: GeometryStage,
     finished: Mapping[str, FinalPart],
-    field: TextureField | None,
+    field: TextureField | TexturesApart | None,
     folder: Path,
     formats: Collection[str | Choice],
     texture_size: int,

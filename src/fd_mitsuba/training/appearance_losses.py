@@ -20,6 +20,7 @@ from fd_mitsuba.config.bounds import Points, Width
 from fd_mitsuba.config.choice import Choice
 from fd_mitsuba.config.registry import Registry
 from fd_mitsuba.fields.texture import TextureField, TextureValues
+from fd_mitsuba.fields.textures_apart import TexturesApart
 from fd_mitsuba.losses.bend import loss_bend
 from fd_mitsuba.losses.style import jittered, loss_style_boundary, loss_style_gradient
 from fd_mitsuba.render.gbuffer import GBuffer
@@ -73,7 +74,7 @@ class TextureSamples:
 
     texture: TextureValues
     gbuffer: GBuffer
-    field: TextureField
+    field: TextureField | TexturesApart
     step: int
     seed: int
 
@@ -201,7 +202,9 @@ class AppearanceLosses:
         }
         return {**self.built_in, **others}
 
-    def __call__(self, texture: TextureValues, gbuffer: GBuffer, field: TextureField, step: int) -> dict[str, Tensor]:
+    def __call__(
+        self, texture: TextureValues, gbuffer: GBuffer, field: TextureField | TexturesApart, step: int
+    ) -> dict[str, Tensor]:
         """The losses by their names, without the weights; UserError where one of another module is no number."""
         seed = seed_for(self._surface.run_seed, Purpose.LOSSES, step)
         at = TextureSamples(texture, gbuffer, field, step, seed)

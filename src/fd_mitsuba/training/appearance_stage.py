@@ -20,6 +20,7 @@ from fd_mitsuba.backend.threads import step_threads
 from fd_mitsuba.config import RunConfig
 from fd_mitsuba.errors import RunStopped
 from fd_mitsuba.fields.texture import TextureField, TextureValues
+from fd_mitsuba.fields.textures_apart import TexturesApart
 from fd_mitsuba.guidance.colour_latents import shine
 from fd_mitsuba.guidance.device import field_device
 from fd_mitsuba.guidance.interface import AppearanceGuidance, AppearanceViews
@@ -35,7 +36,7 @@ from fd_mitsuba.scene.part_material import part_material
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.appearance_losses import AppearanceLosses, PartSurface
 from fd_mitsuba.training.descent import adamw, descend, fade
-from fd_mitsuba.training.region_masks import RegionMasks, shown_first
+from fd_mitsuba.training.region_masks import RegionMasks, one_by_one, shown_first, shown_parts
 from fd_mitsuba.training.seeds import Purpose, seed_for
 from fd_mitsuba.training.single_path import learn_base_material
 from fd_mitsuba.training.stage import StepRecord
@@ -85,7 +86,7 @@ class AppearanceStage:
         self.material = part_material(scene, settings.fixed, settings.normal_map)
         say(self.material.message)
         seed = seed_for(config.seed, Purpose.TEXTURE)
-        self.field = TextureField(config.texture, seed, self.material.start, self.material.learned)
+        self.field = self._new_field(seed)
         if guidance is not None:
             self.field.to(field_device(config.guidance))
         self.optimiser = adamw(self.field, settings)
@@ -160,9 +161,10 @@ class AppearanceStage:
                 control=self._control(gbuffer),
             )
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
-            result = self.guidance.guide_appearance(views, step, settings.steps, guidance_seed)
-            losses["sds"], preview = result.loss, result.preview
-            values.update(result.logs)
+            asked = self._apart(views, gbuffer)
+            results = [self.guidance.guide_appearance(one, step, settings.steps, guidance_seed) for one in asked]
+            losses["sds"], preview = sum(result.loss for result in results), results[step % len(results)].preview
+            values.update({name: float(np.mean([result.logs[name] for result in results])) for name in results[0].logs})
         values = processes().values_of_all(values)
         losses.update(self.losses(texture, gbuffer, self.field, step))
         weights = {"sds": settings.lambda_sds, **self.losses.weights}
@@ -219,6 +221,29 @@ class AppearanceStage:
         """What the guidance's ControlNet, if it has one, is shown of the surface."""
         kind = getattr(self.guidance, "control_sees", None)
         return None if kind is None else surface_views(gbuffer, kind)
+
+    def _new_field(self, seed: int) -> TextureField | TexturesApart:
+        """One for all that grew, or one for each part where all have prompts of their own."""
+        texture, start = self.config.texture, self.material
+        if not self._parts_are_told_apart:
+            return TextureField(texture, seed, start.start, start.learned)
+        fields = [TextureField(texture, seed, start.start, start.learned) for _ in self.parts]
+        return TexturesApart(fields, [self.scene.parts[name] for name in self.parts])
+
+    @property
+    def _parts_are_told_apart(self) -> bool:
+        own = set(self.scene.part_prompts)
+        return len(self.parts) > 1 and own == set(self.parts) and not self.config.appearance.single_path
+
+    def _apart(self, views: AppearanceViews, gbuffer: GBuffer) -> list[AppearanceViews]:
+        """What the guidance is asked in a step: of each part where all have texts of their own and it can be shown one.
+
+        Without `mask_guidance` an answer about one part would move the others, too.
+        """
+        masked = self.config.appearance.mask_guidance and views.condition is not None
+        if not masked or not self._parts_are_told_apart:
+            return [views]
+        return one_by_one(views, dict(zip(self.parts, shown_parts(gbuffer, len(self.parts)), strict=True)))
 
     @torch.no_grad()
     def _condition(self, gbuffer: GBuffer, pictures: AppearancePictures, seed: int, step: int) -> Tensor | None:

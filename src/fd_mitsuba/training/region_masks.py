@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from fd_mitsuba.config import RunConfig
+from fd_mitsuba.guidance.interface import AppearanceViews
 from fd_mitsuba.render.gbuffer import GBuffer
 from fd_mitsuba.render.region_views import RegionViews
 from fd_mitsuba.scene.edit_scene import EditScene
@@ -52,10 +54,40 @@ def shown_first(masks: Mapping[str, Tensor], seen: GBuffer) -> dict[str, Tensor]
     """
     if len(masks) < 2:
         return dict(masks)
-    views, _, size, _ = seen.alpha.shape
-    shown = torch.zeros(len(masks), views * size * size)
-    shown[seen.part, seen.pixel] = (seen.part_mask.flatten()[seen.pixel] > 0).float()
     side = next(iter(masks.values())).shape[-1]
-    shares = adaptive_avg_pool2d(shown.reshape(len(masks), views, size, size), side)[:, :, None]
+    shares = adaptive_avg_pool2d(shown_parts(seen, len(masks)).squeeze(2), side)[:, :, None]
     free = 1 - shares.sum(0)
     return {name: own + free * mask for (name, mask), own in zip(masks.items(), shares, strict=True)}
+
+
+def shown_parts(seen: GBuffer, count: int) -> Tensor:
+    """(count, B, 1, S, S): 1 where a pixel shows the part of that number, the first of those that its samples hit."""
+    views, _, size, _ = seen.alpha.shape
+    shown = torch.zeros(count, views * size * size)
+    shown[seen.part, seen.pixel] = (seen.part_mask.flatten()[seen.pixel] > 0).float()
+    return shown.reshape(count, views, 1, size, size)
+
+
+def one_by_one(views: AppearanceViews, shown: Mapping[str, Tensor]) -> list[AppearanceViews]:
+    """The same views for each part in turn, as if the others belonged to the base, and with that part's text alone.
+
+    A model that was trained on objects with one part takes all that is marked as new for one thing of one colour.
+
+    Args:
+        views: with a condition, and with regions of all parts.
+        shown: part -> (B, 1, S, S), where it is seen.
+    """
+    assert views.condition is not None
+    now, found = views.pictures.detach(), []
+    for name, own in shown.items():
+        regions = {part: torch.full_like(mask, float(part == name)) for part, mask in views.regions.items()}
+        found.append(
+            replace(
+                views,
+                condition=own * views.condition + (1 - own) * now,
+                part_mask=own * views.part_mask,
+                shine=own * views.shine,
+                regions=regions,
+            )
+        )
+    return found
