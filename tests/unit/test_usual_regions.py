@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +185,8 @@ def test_misfits_of_prompt_and_regions_are_told(tmp_path: Path, capsys: pytest.C
     cat = SCENES / "cat" / "scene.xml"
     (mixed,) = prompt_warnings(fd.load_scene(cat, prompt="a cat with wings and a crown"), quick)
     assert "crown, wings, and all regions are of one part" in mixed
+    worn = replace(fd.load_scene(cat, prompt="a cat with wings and a crown"), base_prompt="a cat with a crown")
+    assert prompt_warnings(worn, quick) == []
     hats = fd.load_scene(cat, prompt="a cat with a crown and a hat", at=["head", "head"])
     (shared,) = prompt_warnings(hats, quick)
     assert shared.startswith("parts crown and hat: their regions share a place")

@@ -20,9 +20,11 @@ def prompt_warnings(scene: EditScene, config: RunConfig) -> list[str]:
         return []
     warnings, own = [], scene.part_prompts
 
+    there = set() if scene.subtracts else set(read_prompt(scene.base_prompt, vocabulary).parts)
+
     def asked(prompt: str) -> set[str]:
         reading = read_prompt(prompt, vocabulary, scene.base_prompt)
-        return set(reading.removed if scene.subtracts else reading.parts)
+        return set(reading.removed if scene.subtracts else reading.parts) - there
 
     wanted, names = asked(scene.prompt), list(scene.parts)
     told = set().union(*(asked(prompt.prompt) for prompt in own.values()))
@@ -31,7 +33,7 @@ def prompt_warnings(scene: EditScene, config: RunConfig) -> list[str]:
             f"the prompt speaks of {_listed(wanted)}, and the prompts of the regions, which count where they are seen, "
             f"of {_listed(told)}: say --at for regions of the new prompt, or change theirs"
         )
-    elif len(wanted) > 1 and len(names) == 1:
+    elif len(wanted) > 1 and len(names) == 1 and not scene.earlier:  # those may have grown in an earlier round
         warnings.append(
             f"the prompt speaks of {_listed(wanted)}, and all regions are of one part: they grow as a mixture; an --at "
             "for each, in the prompt's order, puts them apart"
