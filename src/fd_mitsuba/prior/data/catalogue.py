@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -140,10 +140,3 @@ FINE = Catalogue(
     vocabulary=fine_captions.vocabulary(),
     word_lists=fine_captions.word_lists(),
 )
-_SHOWN_BY_COARSE = {part: 0.5 for part in PARTS}
-_WORST_OF_WIDE = dict.fromkeys(
-    ("saddle", "shield", "bow tie", "halo", "fin", "candle", "boots", "mushroom cap", "tusks", "propeller", "glasses"),
-    2.0,
-)
-WIDE = replace(FINE, part_weights={part: (_SHOWN_BY_COARSE | _WORST_OF_WIDE).get(part, 1.0) for part in FINE_PARTS})
-"""As `FINE`, but what the coarse prior knows is shown half as often: prompts of such parts alone get that prior."""

@@ -13,7 +13,6 @@ from fd_mitsuba.prior.data.fine.bodies import BODIES
 from fd_mitsuba.prior.data.fine.captions import caption
 from fd_mitsuba.prior.data.fine.parts import PARTS
 from fd_mitsuba.prior.data.fine.placement import varied
-from fd_mitsuba.prior.data.fine.relief import with_relief
 from fd_mitsuba.prior.data.fine.surface import Surface
 from fd_mitsuba.prior.data.parts import PARTS as PLAIN_PARTS
 from fd_mitsuba.prior.data.parts import resized
@@ -36,8 +35,6 @@ REMOVED_SHARE = 0.1
 """Pairs the other way round: the body with the part is the condition, the bare body what is wanted."""
 BESIDE_SHARE = 0.12
 """Pairs whose body wears another part, before and after."""
-RELIEF_SHARE = 0.5
-"""Bodies with features of their own, for the wide prior."""
 Hits = tuple[np.ndarray, np.ndarray]
 Grow = Callable[[str, Surface, np.random.Generator], Solid | None]
 
@@ -96,30 +93,21 @@ def grow_wide(part: str, surface: Surface, rng: np.random.Generator) -> Solid | 
 
 
 def make_wide_pairs(body: str, parts: list[str | None], seed: int) -> list[FinePair]:
-    """`make_fine_pairs` in views of 32 pixels, for the wide prior; half of the bodies have features of their own."""
-    return make_fine_pairs(body, parts, seed, PLAIN_VIEW_SIZE, grow_wide, RELIEF_SHARE)
+    """`make_fine_pairs` in views of 32 pixels, for the wide prior."""
+    return make_fine_pairs(body, parts, seed, PLAIN_VIEW_SIZE, grow_wide)
 
 
 def make_fine_pairs(
-    body: str,
-    parts: list[str | None],
-    seed: int,
-    view_size: int = VIEW_SIZE,
-    grow: Grow = grow_fine,
-    relief: float = 0.0,
+    body: str, parts: list[str | None], seed: int, view_size: int = VIEW_SIZE, grow: Grow = grow_fine
 ) -> list[FinePair]:
     """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed).
 
     Args:
         view_size: pixels of a view's side.
         grow: (part, surface, rng) -> that part's solid; None: it does not fit there.
-        relief: how likely the body has features of its own, see `with_relief`.
     """
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
-    made = BODIES[body](rng)
-    if relief and rng.random() < relief:
-        made = with_relief(made, rng)
-    surface = Surface(stretched(made, np.diag(random_stretch(rng))))
+    surface = Surface(stretched(BODIES[body](rng), np.diag(random_stretch(rng))))
     overview = global_camera(rng)
     overview_rays = overview.rays(view_size)
     overview_hits = surface.caster.cast(*overview_rays[:2])

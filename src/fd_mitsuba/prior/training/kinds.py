@@ -14,7 +14,7 @@ from transformers import PreTrainedTokenizerFast
 
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.prior.data.captions import AZIMUTH_WORDS, CLOSEUP_WORD
-from fd_mitsuba.prior.data.catalogue import COARSE, FINE, WIDE, Catalogue
+from fd_mitsuba.prior.data.catalogue import COARSE, FINE, Catalogue
 from fd_mitsuba.prior.pictures.colour_corpus import make_colour_pairs
 from fd_mitsuba.prior.pictures.corpus import Pair, make_pairs
 from fd_mitsuba.prior.pictures.fine_colour_corpus import make_fine_colour_pairs
@@ -142,11 +142,11 @@ GEOMETRY_FINE = replace(
 GEOMETRY_WIDE = replace(
     GEOMETRY,
     name="geometry_wide",
-    catalogue=WIDE,
+    catalogue=FINE,
     make_pairs=make_wide_pairs,
     fresh_pairs=6,
-    rounded=0.3,
-    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
+    rounded=0.5,
+    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists, "draft_scale": 2.0},
 )
 APPEARANCE = Kind(
     name="appearance",
