@@ -163,7 +163,8 @@ class AppearanceStage:
             guidance_seed = seed_for(self.config.seed, Purpose.APPEARANCE_GUIDANCE, step)
             asked = self._apart(views, gbuffer)
             results = [self.guidance.guide_appearance(one, step, settings.steps, guidance_seed) for one in asked]
-            losses["sds"], preview = sum(result.loss for result in results), results[step % len(results)].preview
+            losses["sds"] = torch.stack([result.loss for result in results]).sum()
+            preview = results[step % len(results)].preview
             values.update({name: float(np.mean([result.logs[name] for result in results])) for name in results[0].logs})
         values = processes().values_of_all(values)
         losses.update(self.losses(texture, gbuffer, self.field, step))
@@ -256,7 +257,7 @@ class AppearanceStage:
     def _losses(self, say: Callable[[str], None]) -> AppearanceLosses:
         settings, seed = self.config.appearance, self.config.seed
         surface = PartSurface(self.scene, self._points, self.material.learned, seed, say)
-        if settings.single_path:
+        if settings.single_path and isinstance(self.field, TextureField):
             points = points_on([self.scene.base_canonical], _POOL, seed_for(seed, Purpose.BASE_MATERIAL))
             learn_base_material(self.field, surface.base, points, settings.learning_rate, _INITIAL_STEPS, seed)
         return AppearanceLosses(self.config, surface)
