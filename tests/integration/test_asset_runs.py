@@ -59,4 +59,5 @@ def test_the_import_beside_a_run_is_used_again(tmp_path: Path, capfd: pytest.Cap
     assert "imported" not in capfd.readouterr().err
     assert (tmp_path / "mine.scene" / "scene.xml").stat().st_mtime_ns == before
     assert run(*given, "--at", "left side", "--resume") == 1  # regions of another kind: another scene
-    assert "holds a run of another scene" in capfd.readouterr().err
+    assert "holds a run already, of another import" in capfd.readouterr().err
+    assert (tmp_path / "mine.scene" / "scene.xml").stat().st_mtime_ns == before
