@@ -205,3 +205,18 @@ def test_the_scene_of_a_run_is_not_replaced_by_a_refused_one(
     assert main([*run, "--prompt", "a duck with wings", "--resume"]) != 0
     assert "holds a run already, of another import or another prompt" in capsys.readouterr().err
     assert (tmp_path / "run.scene" / "scene.xml").read_bytes() == before
+
+
+def test_regions_of_a_file_are_not_told_beside_those_of_the_import(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own.xml"
+    own.write_text(
+        '<scene version="3.0.0"><integrator type="dual_path"><boolean name="only_these_regions" value="true"/>'
+        '</integrator><shape type="focal_region" id="mine"><transform name="to_world"><scale value="12"/>'
+        '<translate y="30"/></transform></shape></scene>'
+    )
+    main(["check", str(ASSETS / "duck.stl"), "--prompt", "a duck with a crown", "--regions", str(own)])
+    said = capsys.readouterr()
+    assert "imported" in said.err and "head" not in said.err
+    assert "region   mine" in said.out and "usual size" not in said.err

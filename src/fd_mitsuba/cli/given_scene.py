@@ -96,7 +96,10 @@ def _imported(options: argparse.Namespace, beside: Path | None, say: Callable[[s
     imported = import_asset(asset, folder, **wanted)
     write_json(folder / _RECORD, record | {"files": sorted({path.name for path in folder.iterdir()} | {_RECORD})})
     kept = "" if beside is None else f" imported to {imported.scene}"
-    say(f"{asset}:{kept or ' imported'}; {'; '.join([*imported.regions, *imported.remarks, *imported.notes])}")
+    told = [*imported.regions, *imported.remarks, *imported.notes]
+    if options.regions is not None:  # in their place
+        told = [line for line in told if line not in imported.regions and not line.startswith("puts ")]
+    say("; ".join([f"{asset}:{kept or ' imported'}", *told]))
     return imported.scene
 
 
