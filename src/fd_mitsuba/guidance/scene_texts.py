@@ -70,11 +70,15 @@ class SceneTexts:
         return {name: self.embed(read.get(name, without)) for name in passes}
 
     def areas(self, views: GuidanceViews | AppearanceViews, passes: Iterable[str]) -> tuple[Area, ...]:
-        """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out."""
+        """Where the parts with texts of their own are seen; a pass that reads the same as elsewhere is left out, and so
+        is a part that no view shows.
+        """
         found = []
         for part, (prompt, negative) in self.of_parts.items():
             if part not in views.regions:
                 raise ValueError(f"part {part!r} has a prompt, and the views do not say where its regions are seen")
+            if not bool((views.regions[part] > 0).any()):
+                continue
             own = own_passes(negative, self._negative_prompt, self._config.perp_neg, passes)
             mask = tile_views(views.regions[part], self._conventions.view_grid).to(self._device)
             texts = self.embeddings(self.prompts(views, prompt), own, negative)
