@@ -11,6 +11,7 @@ from fd_mitsuba.evaluation.part_judge import CAMERA_RADIUS, VIEW_SIZE
 from fd_mitsuba.extraction.union_surface import UnionSurface
 from fd_mitsuba.render.geometry_pass import GeometryPass
 from fd_mitsuba.scene.edit_scene import EditScene
+from fd_mitsuba.scene.focal_region import deepest_in
 from fd_mitsuba.scene.views import CameraBatch
 from fd_mitsuba.training.geometry_stage import GeometryStage
 
@@ -49,9 +50,8 @@ def before_and_after(
 
 def _belongs_to(scene: EditScene, part: str, points: torch.Tensor) -> torch.Tensor:
     """(N,) whether points (N, 3) are nearer to a part's regions than to those of any other."""
-    place = points.double().numpy()
-    depth = [np.max([region.sdf(place) for region in regions], axis=0) for regions in scene.parts.values()]
-    return torch.from_numpy(np.argmax(depth, axis=0) == list(scene.parts).index(part))
+    owner = deepest_in(points.double().numpy(), scene.parts.values())
+    return torch.from_numpy(owner == list(scene.parts).index(part))
 
 
 def judged_views(

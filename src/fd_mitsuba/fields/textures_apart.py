@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from fd_mitsuba.fields.texture import TextureField, TextureValues
-from fd_mitsuba.scene.focal_region import FocalRegion
+from fd_mitsuba.scene.focal_region import FocalRegion, deepest_in
 
 
 class TexturesApart(nn.Module):
@@ -41,6 +40,4 @@ class TexturesApart(nn.Module):
 
     def owner(self, points: Tensor) -> Tensor:
         """(N,) int64: which part points (N, 3) belong to."""
-        place = points.detach().double().cpu().numpy()
-        depth = [np.max([region.sdf(place) for region in some], axis=0) for some in self._regions]
-        return torch.from_numpy(np.argmax(depth, axis=0))
+        return torch.from_numpy(deepest_in(points.detach().double().cpu().numpy(), self._regions))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -164,3 +165,8 @@ def union_sdf(regions: tuple[FocalRegion, ...] | list[FocalRegion], points: np.n
     for region in regions[1:]:
         result = np.maximum(result, region.sdf(points))
     return result
+
+
+def deepest_in(points: np.ndarray, parts: Iterable[Sequence[FocalRegion]]) -> np.ndarray:
+    """(N,) int64: which part points (N, 3) belong to: in whose regions they lie deepest, or which are nearest."""
+    return np.argmax([union_sdf(list(regions), points) for regions in parts], axis=0)
