@@ -227,7 +227,7 @@ def _words(config: RunConfig) -> Vocabulary | None:
 def _judged_apart(scene: EditScene) -> list[str]:
     """The parts of a scene of several, where all have a prompt of their own; else none."""
     names = list(scene.parts)
-    return names if len(names) > 1 and set(names) == set(scene.part_prompts) else []
+    return names if len(names) > 1 and scene.told_apart else []
 
 
 def _wanted(scene: EditScene, vocabulary: Vocabulary, of: str | None = None) -> str | None:

@@ -18,8 +18,7 @@ def prompt_warnings(scene: EditScene, config: RunConfig) -> list[str]:
     vocabulary = vocabulary_of(config.guidance.model)
     if vocabulary is None or config.geometry.lambda_sds == 0:
         return []
-    warnings, own = [], scene.part_prompts
-
+    warnings = []
     there = set() if scene.subtracts else set(read_prompt(scene.base_prompt, vocabulary).parts)
 
     def asked(prompt: str) -> set[str]:
@@ -27,8 +26,8 @@ def prompt_warnings(scene: EditScene, config: RunConfig) -> list[str]:
         return set(reading.removed if scene.subtracts else reading.parts) - there
 
     wanted, names = asked(scene.prompt), list(scene.parts)
-    told = set().union(*(asked(prompt.prompt) for prompt in own.values()))
-    if set(own) == set(names) and wanted and told and wanted != told:
+    told = set().union(*(asked(prompt.prompt) for prompt in scene.part_prompts.values()))
+    if scene.told_apart and wanted and told and wanted != told:
         warnings.append(
             f"the prompt speaks of {_listed(wanted)}, and the prompts of the regions, which count where they are seen, "
             f"of {_listed(told)}: say --at for regions of the new prompt, or change theirs"

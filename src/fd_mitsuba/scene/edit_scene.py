@@ -86,6 +86,11 @@ class EditScene:
         return self.prompt if own is None else own.prompt
 
     @property
+    def told_apart(self) -> bool:
+        """Whether all parts have prompts of their own."""
+        return set(self.part_prompts) == set(self.parts)
+
+    @property
     def subtracts(self) -> bool:
         """Whether the parts are cut out of the base instead of added; all regions agree."""
         return bool(self.regions) and self.regions[0].mode == SUBTRACT

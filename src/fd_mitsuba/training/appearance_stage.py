@@ -233,8 +233,9 @@ class AppearanceStage:
 
     @property
     def _parts_are_told_apart(self) -> bool:
-        own = set(self.scene.part_prompts)
-        return len(self.parts) > 1 and own == set(self.parts) and not self.config.appearance.single_path
+        all_grew = self.parts.keys() == self.scene.parts.keys()
+        told_apart = len(self.parts) > 1 and self.scene.told_apart and all_grew
+        return told_apart and not self.config.appearance.single_path
 
     def _apart(self, views: AppearanceViews, gbuffer: GBuffer) -> list[AppearanceViews]:
         """What the guidance is asked in a step: of each part where all have texts of their own and it can be shown one.
