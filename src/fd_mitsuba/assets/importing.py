@@ -17,6 +17,7 @@ from fd_mitsuba.assets.shapes import SceneShape, scene_shapes
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.io.float_steps import size_problem
 from fd_mitsuba.scene.enclosure import encloses_volume
+from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.scene.normalisation import Normalisation
 from fd_mitsuba.scene.part_stack import UNITS
 from fd_mitsuba.scene.region_words import ObjectPlaces
@@ -107,6 +108,8 @@ def import_file(
         unit=units or asset.unit,
     )
     scene = write_scene(folder, shapes, to_scene, regions, text, notes)
+    if subtract:
+        notes += _refused(scene)
     if len(shapes) > _MANY_SHAPES:
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
@@ -150,6 +153,15 @@ def _whole(path: Path, shapes: list[SceneShape]) -> tuple[np.ndarray, np.ndarray
     if not encloses_volume(TriangleMesh("base", frame.to_canonical(vertices), faces)):
         raise UserError(f"{path}: its {len(faces)} faces enclose no volume; give a solid object, closed or nearly so")
     return vertices, faces
+
+
+def _refused(scene: Path) -> list[str]:
+    """Why nothing can be cut out of what was written, if so: the mesh is not closed, or all of it would go."""
+    try:
+        load_edit_scene(scene)
+    except UserError as error:
+        return [f"a run refuses the scene as it is: {error}"]
+    return []
 
 
 def _words(path: Path) -> str:
