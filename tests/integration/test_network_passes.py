@@ -14,7 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
-from fd_mitsuba.guidance.interface import GuidanceViews
+from fd_mitsuba.guidance.interface import GuidanceViews, NonFiniteGuidance
 from fd_mitsuba.guidance.network_passes import network_passes
 
 # PyTorch counts the operations of the thread that asks, and several would share the pictures out.
@@ -83,6 +83,33 @@ def test_every_pass_is_counted(
     assert network_passes("coarse", config, AppearanceConfig(), *given) == pytest.approx(expected)
     measured = operations(guidance, STEPS) / (VIEWS * of_one_pass(guidance))
     assert measured == pytest.approx(expected, rel=0.05)
+
+
+def test_a_part_that_is_all_there_is_costs_no_pass_more(folders: dict[str, Path]) -> None:
+    """Its gradient is that of the part's own prompts, set for all; the scene's prompt would go unheard."""
+    guidance, alone = (load(folders["ip2p"], variant="sds", image_guidance_scale=1.0) for _ in range(2))
+    guidance.set_part_prompts(PART)
+    alone.set_prompt(*PART["hat"])
+    gradients = []
+    for asked in (guidance, alone):
+        views = views_of(asked)
+        views.regions["hat"].fill_(1.0)  # pyright: ignore
+        with FlopCounterMode(display=False) as counter:
+            result = asked.guide(views, 0, STEPS, "coarse", seed=3)
+        gradients.append(torch.autograd.grad(result.loss, views.pictures)[0])
+        assert counter.get_total_flops() / (VIEWS * of_one_pass(asked)) == pytest.approx(2, rel=0.05)
+    assert torch.equal(*gradients)
+
+
+def test_weights_that_are_no_numbers_are_named(folders: dict[str, Path]) -> None:
+    for name in ("unet", "text_encoder"):
+        guidance = load(folders["sd15"])
+        values = next(getattr(guidance.components, name).parameters()).detach()
+        kept = values.clone()
+        values.fill_(torch.nan)
+        with pytest.raises(NonFiniteGuidance, match=rf"{name}: its weights have a NaN or an infinity; copy or fetch"):
+            guidance.guide(views_of(guidance), 0, STEPS, "coarse", seed=3)
+        values.copy_(kept)  # other tests share them
 
 
 @pytest.mark.parametrize(("bounds", "most"), [((0.02, 0.98), 2), ((0.02, 0.98), 8), ((0.02, 0.35), 8)])

@@ -80,7 +80,8 @@ def test_worker_processes_fill_the_pool() -> None:
         base, edited, part, captions = pool.batch(4)
     finally:
         pool.close()
-    assert base.shape == edited.shape == (4, 4, 64, 64) and part.shape == (4, 1, 64, 64) and all(captions)
+    assert base.shape == (4, 5, 64, 64) and edited.shape == (4, 4, 64, 64)
+    assert part.shape == (4, 1, 64, 64) and all(captions)
     assert not any(process.is_alive() for process in pool._processes)
 
 

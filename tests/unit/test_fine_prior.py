@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from diffusers import UNet2DConditionModel
 from scipy.spatial import cKDTree
 from torch.nn.functional import avg_pool2d
 
@@ -27,7 +31,7 @@ from fd_mitsuba.prior.data.primitives import Solid, join
 from fd_mitsuba.prior.pictures.colour_corpus import pieces_of
 from fd_mitsuba.prior.pictures.corpus import RayCaster
 from fd_mitsuba.prior.pictures.fine_corpus import VIEW_SIZE, FinePair, make_fine_pairs
-from fd_mitsuba.prior.training.kinds import GEOMETRY, GEOMETRY_FINE
+from fd_mitsuba.prior.training.kinds import GEOMETRY, GEOMETRY_FINE, GEOMETRY_WIDE
 from fd_mitsuba.prior.training.model import TEXT_LENGTH, build_scheduler, build_tokenizer, tokenize
 from fd_mitsuba.prior.training.pool import draw_pairs
 from fd_mitsuba.prior.training.warm_start import load_start
@@ -189,7 +193,8 @@ def test_the_finer_network_starts_with_what_the_coarse_one_knows(drawn: list[Fin
     part = torch.from_numpy(np.stack([pair.changed() for pair in pairs])).float()[:, None]
     alpha_bar = build_scheduler(kind.prediction).alphas_cumprod[300]
     noise = torch.randn(edited.shape, generator=torch.Generator().manual_seed(1))
-    seen = torch.cat([alpha_bar.sqrt() * edited + (1 - alpha_bar).sqrt() * noise, base], 1)
+    told = torch.from_numpy(np.stack([pair.seen() for pair in pairs])).float() / 127
+    seen = torch.cat([alpha_bar.sqrt() * edited + (1 - alpha_bar).sqrt() * noise, told], 1)
     with torch.no_grad():
         words = modules["text_encoder"](tokenize(tokenizer, [pair.caption for pair in pairs])).last_hidden_state
         said = base + modules["unet"](seen, torch.full((len(pairs),), 300), words).sample
@@ -199,6 +204,26 @@ def test_the_finer_network_starts_with_what_the_coarse_one_knows(drawn: list[Fin
 
     assert error(said) < 0.4 * error(base), "random weights are no better than a copy of the base"
     assert avg_pool2d(said, 2).shape[-1] == 64
+
+
+def test_a_wider_first_level_answers_as_the_narrow_one_did(tmp_path: Path) -> None:
+    """Both by Diffusers; the norms over that level and another one together see other means, by a little."""
+    narrow, tokenizer = replace(GEOMETRY_WIDE, channels=(16, 48, 96, 160)), build_tokenizer(FINE.vocabulary)
+    torch.manual_seed(0)
+    answers, noisy = [], torch.randn(2, 4, 64, 64)
+    seen = torch.cat([noisy, torch.zeros(2, 1, 64, 64), torch.rand(2, 4, 64, 64)], 1)
+    for kind in (narrow, GEOMETRY_WIDE):
+        modules = kind.build_modules(tokenizer)
+        load_start(BUILTIN_FOLDER, modules, tokenizer, kind.prediction)
+        with torch.no_grad():
+            words = modules["text_encoder"](tokenize(tokenizer, ["a cat with a crown", "a horse"])).last_hidden_state
+            answers.append([modules["unet"](seen, torch.tensor([time] * 2), words).sample for time in (100, 800)])
+    old: Any = UNet2DConditionModel.from_pretrained(str(BUILTIN_FOLDER / "unet"), local_files_only=True)
+    for first, wider, time in zip(*answers, (100, 800), strict=True):
+        with torch.no_grad():
+            before = old(seen[:, [0, 1, 2, 3, 5, 6, 7, 8]], torch.tensor([time] * 2), words).sample
+        assert torch.allclose(first, before, atol=1e-5), "the region is not seen yet"
+        assert (wider - first).square().mean() < 0.02 * first.square().mean()
 
 
 @pytest.mark.parametrize("part", PARTS)

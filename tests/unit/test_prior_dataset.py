@@ -54,7 +54,8 @@ def test_stored_pairs_are_those_that_were_drawn_and_can_be_trained_on(small_shar
     for i, pair in enumerate(drawn[:10]):
         assert np.array_equal(stored.edited[i], pair.edited) and np.array_equal(stored.changed[i] > 0, pair.changed())
     base, edited, changed, captions = stored.batch(3)
-    assert base.shape == edited.shape == (3, 4, 64, 64) and changed.shape == (3, 1, 64, 64) and len(captions) == 3
+    assert base.shape == (3, 5, 64, 64) and edited.shape == (3, 4, 64, 64)
+    assert changed.shape == (3, 1, 64, 64) and len(captions) == 3
     assert base.abs().max() <= 1 and set(changed.unique().tolist()) <= {0.0, 1.0}
     train(tmp_path / "run", seconds=60, batch_size=2, total_steps=1, pairs=stored)
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1

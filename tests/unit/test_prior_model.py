@@ -30,7 +30,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A pipeline folder made from a checkpoint with random weights."""
     folder = tmp_path_factory.mktemp("prior")
     tokenizer = build_tokenizer()
-    modules = torch.nn.ModuleDict({"text_encoder": build_text_encoder(tokenizer), "unet": build_unet()})
+    modules = torch.nn.ModuleDict({"text_encoder": build_text_encoder(tokenizer), "unet": build_unet(input_channels=9)})
     average = {key: value for key, value in modules.state_dict().items() if value.is_floating_point()}
     torch.save({"average": average}, folder / "checkpoint.pt")
     pack(folder / "checkpoint.pt", folder / "weights")
@@ -102,7 +102,7 @@ def test_diffusers_loads_the_folder_too(packed: Path) -> None:
     from diffusers import StableDiffusionInstructPix2PixPipeline
 
     pipeline = StableDiffusionInstructPix2PixPipeline.from_pretrained(packed, local_files_only=True)
-    assert pipeline.unet.config.in_channels == 8
+    assert pipeline.unet.config.in_channels == 9
     text = "a cow with antlers, azimuth15"
     own = DiffusionGuidance.load(GuidanceConfig(model=str(packed))).components.tokenizer
     assert pipeline.tokenizer(text).input_ids == own(text).input_ids

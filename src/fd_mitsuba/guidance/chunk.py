@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 
@@ -13,7 +14,8 @@ class Beside:
 
     Attributes:
         condition: the base's latents (n, 4, L, L) for 8 input channels; the pass `plain` sees zeros in their place.
-            For 9 channels (n, 5, L, L), the mask first; all passes see it.
+            For 9 channels (n, 5, L, L), the mask first; all passes see an inpainting model's. The base's latents alone
+            are taken for a mask of zeros by a network that is told where the part may be.
         control: pictures (n, 3, H, H) in [0, 1] for the ControlNet; None: it is not asked.
         cameras: (n, 16), of `camera_conditions`, for a network that sees several views at once; its groups are
             consecutive and whole.
@@ -22,6 +24,11 @@ class Beside:
     condition: Tensor | None = None
     control: Tensor | None = None
     cameras: Tensor | None = None
+
+    def told(self, region: Tensor) -> Beside:
+        """The same with another mask (n, 1, L, L)."""
+        assert self.condition is not None
+        return replace(self, condition=torch.cat([region, self.condition[:, -4:]], dim=1))
 
     def rows(self, rows: slice) -> Beside:
         """The same of some of the pictures."""

@@ -1,4 +1,4 @@
-"""What a network sees beside the noisy latents: the base, the base with holes to fill, or the surface for a ControlNet.
+"""What a network sees beside the noisy latents: the base, where on it, or with holes, or the surface for a ControlNet.
 
 Which of them is told by the network's input channels, see `denoiser.Denoiser`.
 """
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
@@ -27,24 +28,59 @@ class Conditions:
         view_grid: pictures are mosaics of view_grid x view_grid views.
         device: where the network runs.
         folder: of the model, for messages.
+        inpaints, sees_region: as `denoiser.Denoiser` has them.
     """
 
     def __init__(
-        self, latents: PictureLatents, config: GuidanceConfig, view_grid: int, device: torch.device, folder: Path
+        self,
+        latents: PictureLatents,
+        config: GuidanceConfig,
+        view_grid: int,
+        device: torch.device,
+        folder: Path,
+        *,
+        inpaints: bool,
+        sees_region: bool,
     ) -> None:
         self._latents, self._config, self._view_grid = latents, config, view_grid
         self._device, self._folder = device, folder
+        self._inpaints, self._sees_region = inpaints, sees_region
 
-    def beside_latents(self, base: Tensor | None, holes: Tensor | None, phase: Phase) -> Tensor | None:
-        """What goes into the network together with z_t: `seen_around` where there are holes, `seen_base` without."""
+    def beside_latents(self, base: Tensor | None, where: Tensor | None, phase: Phase) -> Tensor | None:
+        """What goes into the network together with z_t.
+
+        Args:
+            base: its pictures, or None.
+            where: (N, 1, L, L) of `where`, or None.
+            phase: whose pictures they are.
+        """
         if base is None:
             return None
-        return self.seen_base(base, phase) if holes is None else self.seen_around(base, holes, phase)
+        if where is None:
+            return self.seen_base(base, phase)
+        return self.seen_around(base, where, phase) if self._inpaints else self.seen_there(base, where, phase)
+
+    def where(self, views: GuidanceViews | AppearanceViews) -> Tensor | None:
+        """(N, 1, L, L) `holes` for an inpainting model, `region` for one that is told it, None for others."""
+        if self._inpaints:
+            return self.holes(views)
+        return self.region(views) if self._sees_region else None
+
+    def region(self, views: GuidanceViews | AppearanceViews) -> Tensor:
+        """(N, 1, L, L) in [0, 1]: the share of each cell in which a focal region is seen; zeros where none is told."""
+        size, shares = self._latents.latent_size, sum(views.regions.values(), torch.zeros(()))
+        if not views.regions:
+            return torch.zeros(len(views.pictures) // self._view_grid**2, 1, size, size, device=self._device)
+        return adaptive_avg_pool2d(tile_views(shares, self._view_grid), size).clamp(max=1).to(self._device)
 
     @torch.no_grad()
     def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
         """The base's latents (N, 4, L, L) as InstructPix2Pix takes them: as the encoder gives them, not scaled."""
         return self._latents.unscaled(self._latents(base, phase))
+
+    def seen_there(self, base: Tensor, region: Tensor, phase: Phase) -> Tensor:
+        """(N, 5, L, L): the region, and the base's latents as `seen_base` has them."""
+        return torch.cat([region, self.seen_base(base, phase)], dim=1)
 
     @torch.no_grad()
     def seen_around(self, base: Tensor, holes: Tensor, phase: Phase) -> Tensor:

@@ -67,7 +67,15 @@ class DiffusionGuidance(Denoiser):
         self.view_grid = components.conventions.view_grid
         self.normal_space: NormalSpace | None = components.conventions.normal_space
         self.latents = PictureLatents(components.vae, components.conventions, config, self.latent_size)
-        self.conditions = Conditions(self.latents, config, self.view_grid, self.device, components.folder)
+        self.conditions = Conditions(
+            self.latents,
+            config,
+            self.view_grid,
+            self.device,
+            components.folder,
+            inpaints=self.inpaints,
+            sees_region=self.sees_region,
+        )
         embed = TextEmbeddings(components.tokenizer, components.text_encoder, self.device, components.words)
         self.texts = SceneTexts(embed, self.conventions, config, self.latent_size, self.device)
         self.draws = StepDraws(
@@ -136,7 +144,7 @@ class DiffusionGuidance(Denoiser):
     @property
     def region_size(self) -> int | None:
         """Side in pixels of `GuidanceViews.regions`; None where they are not looked at."""
-        return self.latent_size // self.view_grid if self.texts.of_parts or self.inpaints else None
+        return self.latent_size // self.view_grid if self.texts.of_parts or self.inpaints or self.sees_region else None
 
     @property
     def control_sees(self) -> str | None:
@@ -234,7 +242,7 @@ class DiffusionGuidance(Denoiser):
         step = StepPictures(
             images,
             base,
-            self.conditions.holes(views) if self.inpaints else None,
+            self.conditions.where(views),
             Beside(control=control, cameras=None if cameras is None else cameras.to(self.device)),
             *drawn,
             lesson,

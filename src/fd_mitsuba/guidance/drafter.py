@@ -63,7 +63,8 @@ class DiffusionDrafter:
         texts = guidance.embeddings(guidance.prompts(views), passes)
         noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed)).to(guidance.device)
         none = torch.zeros(len(base), dtype=torch.int64, device=guidance.device)
-        beside = Beside(guidance.seen_base(images, "coarse"))
+        conditions = guidance.conditions
+        beside = Beside(conditions.beside_latents(images, conditions.where(views), "coarse"))
         chunk = Chunk(base, noise, none, texts, beside, areas=guidance.texts.areas(views, passes))
         latents = sample(Query(guidance, chunk, how).guided, guidance.alpha_bars, noise, STEPS)
         return Drawn(latents.cpu(), self._part(base, latents).cpu(), float(_difference(base, latents).abs().mean()))

@@ -179,6 +179,10 @@ def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: M
         )
     if latent != 4 or unet.get("out_channels", 4) != 4:
         raise UserError(f"{path}: UNet and VAE must share 4 latent channels; take a Stable Diffusion 1.x/2.x model")
+    if conventions.sees_region and channels != 9:
+        raise UserError(
+            f"{folder / FILE_NAME}: sees_region but the UNet has {channels} input channels, not 9; mend sees_region"
+        )
     check_square(path, unet, "sample_size")
     _check_counts(path, unet, "block_out_channels")
     _check_vae(folder / "vae" / "config.json", vae)

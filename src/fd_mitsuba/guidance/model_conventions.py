@@ -37,6 +37,9 @@ class ModelConventions(BaseModel):
     predicts: Literal["clean", "difference"] = "clean"
     """What a UNet with prediction type `sample` says: the clean latents, or what must be added to the condition's as
     the VAE gives them, without a scaling factor."""
+    sees_region: bool = False
+    """Whether a UNet with 9 input channels is told by the fifth where the part may be, and sees the base whole, which
+    one pass of classifier-free guidance leaves out; else 9 channels are those of an inpainting model."""
     background: Literal["black", "white"] | None = None
     """Behind the objects of the training pictures, if always the same. For people, not checked."""
     prompt_template: str = "{prompt}, {closeup}, {view}"

@@ -29,8 +29,8 @@ class StepPictures:
     Attributes:
         images: as the phase has them; gradients may be asked for.
         base: the unedited base, of the same views, or None.
-        holes: (N, 1, L, L), what an inpainting model is to paint, or None.
-        beside: what the network sees besides; its `condition` is made of `base` and `holes`, chunk by chunk.
+        where: (N, 1, L, L), what an inpainting model is to paint, or where the part may be, or None.
+        beside: what the network sees besides; its `condition` is made of `base` and `where`, chunk by chunk.
         timesteps: (N,); noise: (N, 4, L, L).
         lesson: the same for what the critic is taught, or None.
         texts: pass -> (N, length, width).
@@ -40,7 +40,7 @@ class StepPictures:
 
     images: Tensor
     base: Tensor | None
-    holes: Tensor | None
+    where: Tensor | None
     beside: Beside
     timesteps: Tensor
     noise: Tensor
@@ -119,7 +119,7 @@ def picture_gradient(
         leaf = step.images[rows].detach().requires_grad_(track)
         with torch.set_grad_enabled(track):
             z = encode(leaf, phase)
-        condition = conditions.beside_latents(some(step.base, rows), some(step.holes, rows), phase)
+        condition = conditions.beside_latents(some(step.base, rows), some(step.where, rows), phase)
         chunk = step.chunk(rows, z.detach(), condition)
         gradient, preview = denoiser.latent_gradient(chunk, how)
         if step.lesson is not None and track:
@@ -138,12 +138,18 @@ def picture_gradient(
 
 def _require_finite(gradient: Tensor, timesteps: Tensor, where: str, denoiser: Denoiser) -> None:
     bad = ~gradient.isfinite().flatten(1).all(1)
-    if bad.any():
-        raise NonFiniteGuidance(
-            f"{denoiser.components.folder}: the guidance gradient of the {where} is not finite at timestep "
-            f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
-            "lower guidance.guidance_scale"
-        )
+    if not bad.any():
+        return
+    folder = denoiser.components.folder
+    for name in ("unet", "text_encoder", "vae"):
+        weights = getattr(denoiser.components, name).parameters()
+        if not all(bool(values.isfinite().all()) for values in weights):
+            raise NonFiniteGuidance(f"{folder / name}: its weights have a NaN or an infinity; copy or fetch them again")
+    raise NonFiniteGuidance(
+        f"{folder}: the guidance gradient of the {where} is not finite at timestep "
+        f"{', '.join(str(int(t)) for t in timesteps[bad])}; set guidance.dtype to float32 or "
+        "lower guidance.guidance_scale"
+    )
 
 
 def _scale_of_all(gradient: Tensor, mask: Tensor | None) -> float:

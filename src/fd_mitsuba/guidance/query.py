@@ -20,7 +20,7 @@ from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.config.sections import AppearanceConfig
 from fd_mitsuba.conventions import Weighting
 from fd_mitsuba.guidance import sds
-from fd_mitsuba.guidance.chunk import NOTHING, Beside, Chunk
+from fd_mitsuba.guidance.chunk import NOTHING, Area, Beside, Chunk
 from fd_mitsuba.guidance.critic import Critic
 from fd_mitsuba.guidance.interface import Phase
 
@@ -119,6 +119,9 @@ class Network(Protocol):
     def has_image_pass(self) -> bool: ...
 
     @property
+    def sees_region(self) -> bool: ...
+
+    @property
     def alpha_bars(self) -> Tensor: ...
 
     def predict_noise(
@@ -155,20 +158,31 @@ class Query:
         return sds.add_noise(self.chunk.z, self.noise, self.alpha_bar(timesteps))
 
     def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
-        """Noise of each named pass: e + sum over areas of mask (e(area's text) - e)."""
+        """Noise of each named pass: e + sum over areas of mask (e(area's text) - e).
+
+        A network that is told where the part may be is told of that area alone with its text. Where an area is all there
+        is, nothing else is asked.
+        """
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
         if missing := set(names) - set(texts):
             raise ValueError(f"{type(self.how.variant).__name__}: asks for {sorted(missing)}, not among its `passes`")
         beside = self.chunk.beside
+        for area in self.chunk.areas:
+            if bool((area.mask == 1).all()):
+                own = {name: area.texts.get(name, text) for name, text in texts.items()}
+                return self.network.predict_noise(z_t, timesteps, own, self._beside(area))
         seen = self.network.predict_noise(z_t, timesteps, texts, beside)
         merged = dict(seen)
         for area in self.chunk.areas:
             own = {name: area.texts[name] for name in texts if name in area.texts}
             if not own:
                 continue
-            for name, noise in self.network.predict_noise(z_t, timesteps, own, beside).items():
+            for name, noise in self.network.predict_noise(z_t, timesteps, own, self._beside(area)).items():
                 merged[name] = merged[name] + area.mask * (noise - seen[name])
         return merged
+
+    def _beside(self, area: Area) -> Beside:
+        return self.chunk.beside.told(area.mask) if self.network.sees_region else self.chunk.beside
 
     def guided(self, z_t: Tensor, timesteps: Tensor) -> Tensor:
         """e_hat: classifier-free guidance; with `perp_neg` less scale perp_neg perp(e(negative) - e(free)).

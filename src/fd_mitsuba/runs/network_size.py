@@ -9,6 +9,7 @@ from typing import Any
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.builtin import shipped_folder
 from fd_mitsuba.guidance.layout import count_weights, read_json, weight_files
+from fd_mitsuba.guidance.model_conventions import read_model_conventions
 
 
 @dataclass(frozen=True)
@@ -20,17 +21,19 @@ class NetworkSize:
         source: how that is known.
         latent_size: cells a side of the latents that it was made for.
         channels: of its input.
+        sees_region: whether one of them tells where the part may be.
     """
 
     weights: float = 860e6
     source: str = "as Stable Diffusion 1.5; the model is not in a local folder"
     latent_size: int = 64
     channels: int = 4
+    sees_region: bool = False
 
     @property
     def has_image_pass(self) -> bool:
         """As `Denoiser.has_image_pass`."""
-        return self.channels == 8
+        return self.channels == 8 or self.sees_region
 
 
 def network_size(model: str, appearance: bool = False) -> NetworkSize:
@@ -44,15 +47,16 @@ def network_size(model: str, appearance: bool = False) -> NetworkSize:
     usual = NetworkSize()
     try:
         config = read_json(folder / "unet" / "config.json")
+        sees_region = read_model_conventions(folder).sees_region
     except UserError:
-        config = {}
+        config, sees_region = {}, False
     size, channels = (_number(config, *keys) for keys in (("sample_size", "image_size"), ("in_channels",)))
     try:
         weights: float = sum(map(count_weights, weight_files(folder, "unet")[0]))
         source = "the built-in prior" if shipped else f"from {folder / 'unet'}"
     except (UserError, OSError):  # none, or a damaged file, which the run will refuse
         weights, source = usual.weights, usual.source
-    return NetworkSize(weights, source, size or usual.latent_size, channels or usual.channels)
+    return NetworkSize(weights, source, size or usual.latent_size, channels or usual.channels, sees_region)
 
 
 def _number(config: dict[str, Any], *keys: str) -> int | None:

@@ -57,9 +57,11 @@ def draw_samples(
     """Clean latents (N, 4, 64, 64) after `steps` DDIM steps from noise, given the base's latents and full captions.
 
     Args:
+        base: (N, C, 64, 64), the base's latents, after the region where the network is told it.
         mask: (N, 1, 64, 64) of zeros and ones: where noise is; elsewhere the picture is the base's, at every step.
     """
     generator = torch.Generator().manual_seed(seed)
+    seen, base = base, base[:, -4:]
     z = torch.randn(base.shape, generator=generator)
     passes = sds.cfg_coefficients_with_image(scale, 1.0)
     texts = guidance.embeddings(captions, passes)
@@ -68,9 +70,14 @@ def draw_samples(
         repeated = now.repeat(len(base))
         if mask is not None:
             z = torch.where(mask > 0, z, guidance.alpha_bars[now].sqrt() * base)
-        noise = sds.combine(guidance.predict_noise(z, repeated, texts, Beside(base)), passes)
+        noise = sds.combine(guidance.predict_noise(z, repeated, texts, Beside(seen)), passes)
         z = sds.ddim_step(z, noise, guidance.alpha_bars[repeated], guidance.alpha_bars[following.repeat(len(base))])
     return z if mask is None else torch.where(mask > 0, z, base)
+
+
+def seen_by(guidance: DiffusionGuidance, pair: Pair) -> np.ndarray:
+    """(C, L, L) int8 what a prior sees of a pair beside the noise."""
+    return pair.seen() if guidance.sees_region else pair.base
 
 
 def evaluate(
@@ -99,8 +106,8 @@ def evaluate(
     rows, judged = [], []
     for number, body in enumerate(bodies):
         pairs = kind.make_pairs(body, [*parts, None], UNSEEN_SEED + 1000 * seed + known.index(body))
-        base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
-        sampled = draw_samples(guidance, base, [pair.caption for pair in pairs], seed * 100 + number, steps)
+        seen = torch.from_numpy(np.stack([seen_by(guidance, pair) for pair in pairs])).float() / 127
+        sampled = draw_samples(guidance, seen, [pair.caption for pair in pairs], seed * 100 + number, steps)
         judged += [_judge(pair, latent.numpy()) for pair, latent in zip(pairs, sampled, strict=True)]
         order = sorted(range(len(pairs)), key=lambda i: pairs[i].closeup)
         truth = np.concatenate([picture(pairs[i].edited / 127.0) for i in order], axis=1)

@@ -26,6 +26,7 @@ from fd_mitsuba.prior.judging.evaluate import (
     draw_samples,
     keeps_body,
     picture,
+    seen_by,
 )
 from fd_mitsuba.prior.judging.single_views import seen_by_judge, views_of
 from fd_mitsuba.prior.pictures.corpus import Pair
@@ -122,9 +123,9 @@ def evaluate_parts(
         # The same body and overview again, whose second parts of each name are others.
         again = [p for p in kind.make_pairs(body, [*own_parts, *own_parts], body_seed) if not p.closeup]
         others: dict[str | None, Pair] = {p.part: p for p in again[len(own_parts) :] if not p.removed}
-        base = torch.from_numpy(np.stack([pair.base for pair in pairs])).float() / 127
+        seen = torch.from_numpy(np.stack([seen_by(guidance, pair) for pair in pairs])).float() / 127
         captions = [pair.caption for pair in pairs]
-        samples = draw_samples(guidance, base, captions, seed * 100 + number, steps, scale).numpy()
+        samples = draw_samples(guidance, seen, captions, seed * 100 + number, steps, scale).numpy()
         of_body = [
             judge_sample(
                 pair,

@@ -17,6 +17,7 @@ from fd_mitsuba.prior.data.bodies import BODIES
 from fd_mitsuba.prior.data.captions import caption, random_style, view_words
 from fd_mitsuba.prior.data.parts import PARTS, resized
 from fd_mitsuba.prior.data.primitives import Solid, transform
+from fd_mitsuba.prior.pictures.region_picture import UNTOLD_SHARE, region_picture, regions_anywhere, regions_around
 from fd_mitsuba.scene.vertex_normals import vertex_normals
 
 VIEW_SIZE = 32
@@ -25,6 +26,8 @@ LEAST_PIXELS = 12
 """Of a mosaic that a part must change to be seen at all."""
 STYLED_SHARE = 0.3
 """Captions that also name a colour or material, which normals do not show: the words must not disturb the shape."""
+REGION_STREAM = (11,)
+"""Before the seed of what is drawn for regions alone."""
 STRETCH = 0.12
 """Most that an object is longer or shorter along an axis, as a logarithm: people's meshes have other proportions."""
 
@@ -35,6 +38,7 @@ class Pair:
 
     Attributes:
         removed: the part is in `base` and not in `edited`.
+        region: (L, L) where the part may be, see `region_picture`; None: the prior is not told.
     """
 
     base: np.ndarray
@@ -45,6 +49,11 @@ class Pair:
     azimuth_deg: float
     closeup: bool
     removed: bool = field(default=False, kw_only=True)
+    region: np.ndarray | None = field(default=None, kw_only=True)
+
+    def seen(self) -> np.ndarray:
+        """(C, L, L) what the network sees beside the noise: the region where it is told, then the base."""
+        return self.base if self.region is None else np.concatenate([self.region[None], self.base])
 
     def changed(self) -> np.ndarray:
         """Where the part is (L, L) bool: the pixels that count most in training."""
@@ -155,11 +164,26 @@ def random_stretch(rng: np.random.Generator) -> np.ndarray:
     return np.diag(np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
 
 
+def told_region(
+    part: Solid | None,
+    body: Solid,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    rng: np.random.Generator,
+    view_size: int = VIEW_SIZE,
+) -> np.ndarray:
+    """(L, L) int8 what a picture tells of where its part may be; without a part, somewhere on the body."""
+    untold = rng.random() < UNTOLD_SHARE
+    regions = regions_anywhere(body, rng) if part is None else regions_around(part, rng)
+    return region_picture([] if untold else regions, origins, directions, view_size, SUPERSAMPLING)
+
+
 def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
     """Two pairs (global, close) a part for one random body, deterministic in (body, parts, seed)."""
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
     made = BODIES[body](rng)
     stretch = random_stretch(rng)
+    region_rng = np.random.default_rng([*REGION_STREAM, seed, list(BODIES).index(body)])
     base_caster, overview, pairs = RayCaster(transform(made.solid, stretch)), global_camera(rng), []
     overview_hits = None
     for part in parts:
@@ -181,6 +205,7 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
                     np.where(nearer, part_distance, distance),
                     np.where(nearer[:, None], part_normal, normal),
                 )
+            region = told_region(solid, made.solid, origins, directions, region_rng)
             style = random_style(rng) if rng.random() < STYLED_SHARE else ""
             words = f"{caption(body, part, rng, style)}, {view_words(camera.azimuth_deg, closeup)}"
             pairs.append(
@@ -192,6 +217,7 @@ def make_pairs(body: str, parts: list[str | None], seed: int) -> list[Pair]:
                     part,
                     camera.azimuth_deg,
                     closeup,
+                    region=region,
                 )
             )
     return pairs

@@ -17,8 +17,8 @@ from fd_mitsuba.prior.data.fine.surface import Surface
 from fd_mitsuba.prior.data.parts import PARTS as PLAIN_PARTS
 from fd_mitsuba.prior.data.parts import resized
 from fd_mitsuba.prior.data.primitives import Solid, join, transform
-from fd_mitsuba.prior.pictures.corpus import VIEW_SIZE as PLAIN_VIEW_SIZE
 from fd_mitsuba.prior.pictures.corpus import (
+    REGION_STREAM,
     MosaicCamera,
     Pair,
     RayCaster,
@@ -26,7 +26,9 @@ from fd_mitsuba.prior.pictures.corpus import (
     global_camera,
     random_stretch,
     shade,
+    told_region,
 )
+from fd_mitsuba.prior.pictures.corpus import VIEW_SIZE as PLAIN_VIEW_SIZE
 
 VIEW_SIZE = 64
 LEAST_PIXELS = 40
@@ -107,6 +109,7 @@ def make_fine_pairs(
         grow: (part, surface, rng) -> that part's solid; None: it does not fit there.
     """
     rng = np.random.default_rng([seed, list(BODIES).index(body)])
+    region_rng = np.random.default_rng([*REGION_STREAM, seed, list(BODIES).index(body)])
     surface = Surface(stretched(BODIES[body](rng), np.diag(random_stretch(rng))))
     overview = global_camera(rng)
     overview_rays = overview.rays(view_size)
@@ -115,8 +118,9 @@ def make_fine_pairs(
     before: tuple[str, RayCaster] | None = None
 
     def add(
-        camera: MosaicCamera, rays: tuple, base: Hits, own: RayCaster | None, part: str | None, closeup: bool
+        camera: MosaicCamera, rays: tuple, base: Hits, solid: Solid | None, own: RayCaster | None, closeup: bool
     ) -> None:
+        part = None if own is None else name
         beside = None
         if before is not None and before[0] != part and rng.random() < BESIDE_SHARE:
             beside, base = before[0], nearer(base, before[1].cast(*rays[:2]))
@@ -126,18 +130,19 @@ def make_fine_pairs(
         first, second = (shade(*hits, rays[2], view_size) for hits in (base, edited))
         if removed:
             first, second = second, first
+        region = told_region(solid, surface.body.solid, *rays[:2], region_rng, view_size)
         view = camera.azimuth_deg, closeup
-        pairs.append(FinePair(first, second, words, body, part, *view, removed=removed, beside=beside))
+        pairs.append(FinePair(first, second, words, body, part, *view, removed=removed, beside=beside, region=region))
 
-    for part in parts:
-        solid = None if part is None else grow(part, surface, rng)
-        if part is None or solid is None:
+    for name in parts:
+        solid = None if name is None else grow(name, surface, rng)
+        if name is None or solid is None:
             add(overview, overview_rays, overview_hits, None, None, False)
             continue
         own = RayCaster(solid)
-        add(overview, overview_rays, overview_hits, own, part, False)
+        add(overview, overview_rays, overview_hits, solid, own, False)
         near = closeup_camera(solid, rng)
         rays = near.rays(view_size)
-        add(near, rays, surface.caster.cast(*rays[:2]), own, part, True)
-        before = part, own
+        add(near, rays, surface.caster.cast(*rays[:2]), solid, own, True)
+        before = name, own
     return pairs

@@ -1,8 +1,9 @@
 """Training pairs in files: made ahead, looked at, shared, and read again by `prior train --data`.
 
-A folder holds `dataset.json` and shards `pairs_00000.npz` (base, edited: (N, 4, L, L) int8 in units of 1/127;
-changed: (N, L, L / 8) uint8, the part's pixels packed by `numpy.packbits`) with `pairs_00000.jsonl` beside them: a line
-a pair with its caption, body, part, first azimuth, whether it is a close-up and whether the part is taken away.
+A folder holds `dataset.json` and shards `pairs_00000.npz` (base: (N, C, L, L) int8 in units of 1/127, its latents
+after the region where the kind is told it; edited: (N, 4, L, L) likewise; changed: (N, L, L / 8) uint8, the part's
+pixels packed by `numpy.packbits`) with `pairs_00000.jsonl` beside them: a line a pair with its caption, body, part,
+first azimuth, whether it is a close-up and whether the part is taken away.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def _write_shard(folder: Path, number: int, size: int, seed: int, kind: Kind) ->
     data = io.BytesIO()
     np.savez_compressed(
         data,
-        base=np.stack([pair.base for pair in pairs]),
+        base=np.stack([pair.seen() for pair in pairs]),
         edited=np.stack([pair.edited for pair in pairs]),
         changed=np.packbits(np.stack([pair.changed() for pair in pairs]), axis=-1),
     )

@@ -87,6 +87,11 @@ class Kind:
     conventions: dict[str, Any]
 
     @property
+    def input_channels(self) -> int:
+        """Of the UNet: the noisy latents', the condition's, and where it is told it the region's."""
+        return 9 if self.conventions.get("sees_region") else 8
+
+    @property
     def difference(self) -> bool:
         """Whether the UNet says only what must be added to the condition."""
         return self.conventions.get("predicts") == "difference"
@@ -97,7 +102,9 @@ class Kind:
         return torch.nn.ModuleDict(
             {
                 "text_encoder": encoder,
-                "unet": build_unet(self.channels, self.text_width, self.norm_groups, 2 * self.view_size),
+                "unet": build_unet(
+                    self.channels, self.text_width, self.norm_groups, 2 * self.view_size, self.input_channels
+                ),
             }
         )
 
@@ -127,7 +134,7 @@ GEOMETRY = Kind(
     rounded=0.0,
     prediction="sample",
     build_vae=build_vae,
-    conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference"},
+    conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference", "sees_region": True},
 )
 GEOMETRY_FINE = replace(
     GEOMETRY,
@@ -144,6 +151,7 @@ GEOMETRY_WIDE = replace(
     name="geometry_wide",
     catalogue=FINE,
     make_pairs=make_wide_pairs,
+    channels=(32, 48, 96, 160),
     fresh_pairs=6,
     rounded=0.5,
     conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists, "draft_scale": 2.0},

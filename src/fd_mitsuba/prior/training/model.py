@@ -24,6 +24,9 @@ ATTENTION_CELLS = (16, 8)
 """Sides of the levels with attention: above 16 x 16 cells it is what costs."""
 
 
+FIRST_LAYER = "conv_in.weight"
+
+
 def build_tokenizer(words: Sequence[str] | None = None) -> PreTrainedTokenizerFast:
     """A CLIP-format byte-pair tokenizer in which every word is a single token, always the same one.
 
@@ -105,12 +108,21 @@ def load_packed(
     modules["text_encoder"].load_state_dict({**text, key: embedding})
     if not with_unet:
         return
-    modules["unet"].load_state_dict(load_file(packed / "unet" / "diffusion_pytorch_model.safetensors"))
+    unet = load_file(packed / "unet" / "diffusion_pytorch_model.safetensors")
+    unet[FIRST_LAYER] = with_region(unet[FIRST_LAYER], modules["unet"].state_dict()[FIRST_LAYER].shape[1])
+    modules["unet"].load_state_dict(unet)
     before = json.loads((packed / "scheduler" / "scheduler_config.json").read_text(encoding="utf-8"))["prediction_type"]
     if {before, prediction_type} == {"v_prediction", "sample"}:
         with torch.no_grad():
             for parameter in modules["unet"].get_submodule("conv_out").parameters():
                 parameter.neg_()
+
+
+def with_region(first: torch.Tensor, channels: int) -> torch.Tensor:
+    """The first layer's weights (out, `channels`, 3, 3): those of 8 channels see nothing yet of the region."""
+    if first.shape[1] == channels:
+        return first
+    return torch.cat([first[:, :4], torch.zeros_like(first[:, :1]), first[:, 4:]], dim=1)
 
 
 def token_numbers(tokenizer: PreTrainedTokenizerFast) -> dict[str, Any]:
@@ -139,12 +151,15 @@ def build_unet(
     text_width: int = TEXT_WIDTH,
     norm_groups: int = 16,
     latent_size: int = LATENT_SIZE,
+    input_channels: int = 8,
 ) -> UNet2DConditionModel:
-    """The denoiser: 8 channels in (noisy latent, condition's latent), 4 out, attention at 16 and 8 cells a side."""
+    """The denoiser: 8 channels in (noisy latent, condition's latent) or 9 (noisy latent, region, condition's latent), 4
+    out, attention at 16 and 8 cells a side.
+    """
     attends = [latent_size >> level in ATTENTION_CELLS for level in range(len(channels))]
     return UNet2DConditionModel(
         sample_size=latent_size,
-        in_channels=8,
+        in_channels=input_channels,
         out_channels=4,
         layers_per_block=1,
         block_out_channels=channels,

@@ -39,7 +39,9 @@ class Pairs(Protocol):
         """Bring `count` more pairs in, if that is how it works."""
 
     def batch(self, size: int) -> Batch:
-        """Base and edited latents (size, 4, L, L) in [-1, 1], the part's pixels (size, 1, L, L), and captions."""
+        """What the network sees (size, C, L, L), edited latents (size, 4, L, L), the part's pixels (size, 1, L, L), and
+        captions; values in [-1, 1].
+        """
         ...
 
 
@@ -62,7 +64,7 @@ class Pool:
     def batch(self, size: int) -> Batch:
         """As `Pairs.batch`."""
         chosen = [self._pairs[i] for i in self._rng.integers(len(self._pairs), size=size)]
-        base = torch.from_numpy(np.stack([p.base for p in chosen])).float() / 127
+        base = torch.from_numpy(np.stack([p.seen() for p in chosen])).float() / 127
         edited = torch.from_numpy(np.stack([p.edited for p in chosen])).float() / 127
         changed = torch.from_numpy(np.stack([p.changed() for p in chosen])).float()[:, None]
         return base, edited, changed, [p.caption for p in chosen]
@@ -85,7 +87,8 @@ class WorkerPool:
         side = 2 * kind.view_size
         self._rng, self._made, self._device = np.random.default_rng(seed), 0, device
         self._base, self._edited = (
-            torch.empty((capacity, 4, side, side), dtype=torch.int8, device=device) for _ in range(2)
+            torch.empty((capacity, channels, side, side), dtype=torch.int8, device=device)
+            for channels in (kind.input_channels - 4, 4)
         )
         self._changed = torch.empty((capacity, 1, side, side), dtype=torch.bool, device=device)
         self._captions = [""] * capacity
@@ -152,5 +155,5 @@ def _fill(pairs: multiprocessing.Queue, kind_name: str, seed: int, number: int) 
         made = draw_pairs(kind, rng)
         if made:
             # Arrays of all at once: thousands of small objects a second would keep the training busy with unpacking.
-            base, edited, changed = zip(*((pair.base, pair.edited, pair.changed()) for pair in made), strict=True)
+            base, edited, changed = zip(*((pair.seen(), pair.edited, pair.changed()) for pair in made), strict=True)
             pairs.put((np.stack(base), np.stack(edited), np.stack(changed), [pair.caption for pair in made]))

@@ -64,7 +64,8 @@ class TrainingStep:
         """Change the weights, in place; a batch whose gradient is not finite leaves them as they are.
 
         Args:
-            base, edited: latents (N, 4, L, L) in [-1, 1].
+            base: (N, C, L, L) in [-1, 1], what the network sees beside the noise, the base's latents last.
+            edited: latents (N, 4, L, L) in [-1, 1].
             changed: the part's pixels (N, 1, L, L), 0 or 1.
             keep_base: (N, 1, 1, 1), 0 where the network must do without the base, else 1.
             tokens: (N, TEXT_LENGTH).
@@ -79,6 +80,7 @@ class TrainingStep:
         if kind.masked_noise:
             masked = torch.rand(size, generator=generator, device=place) < kind.masked_noise
             noise = torch.where(masked[:, None, None, None], noise * changed, noise)
+        seen, base = base * keep_base, base[:, -edited.shape[1] :]
         shown = edited
         if kind.rounded:
             chosen = torch.rand(size, generator=generator, device=place) < kind.rounded
@@ -86,8 +88,8 @@ class TrainingStep:
         a = self._alphas[times][:, None, None, None]
         noisy = a.sqrt() * shown + (1 - a).sqrt() * noise
         target = edited if kind.prediction == "sample" else a.sqrt() * noise - (1 - a).sqrt() * edited
-        condition = torch.cat([noisy, base * keep_base], 1).contiguous(memory_format=self._format)
-        kept = base * keep_base if kind.difference else torch.zeros_like(edited)
+        condition = torch.cat([noisy, seen], 1).contiguous(memory_format=self._format)
+        kept = seen[:, -4:] if kind.difference else torch.zeros_like(edited)
         batch = condition, times, tokens, target - kept, changed
 
         def share(modules: torch.nn.ModuleDict, samples: slice, batch: Sequence[torch.Tensor] = batch) -> ShareLoss:
