@@ -17,12 +17,15 @@ from fd_mitsuba.guidance.builtin import WIDE_FOLDER
 from fd_mitsuba.guidance.model_conventions import read_model_conventions
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
-from fd_mitsuba.guidance.prompted_part import prompted_part, prompted_parts
+from fd_mitsuba.guidance.prompted_part import prompted_parts
 from fd_mitsuba.prior.data.bodies import BODIES
+from fd_mitsuba.prior.data.fine.bodies import BODIES as FINE_BODIES
+from fd_mitsuba.prior.data.fine.parts import PARTS as FINE_PARTS
+from fd_mitsuba.prior.data.fine.surface import Surface
 from fd_mitsuba.prior.data.parts import PARTS
 from fd_mitsuba.runs.prompt_fit import prompt_warnings
 from fd_mitsuba.scene.region_words import ObjectPlaces
-from fd_mitsuba.scene.usual_regions import USUAL_REGIONS, usual_place
+from fd_mitsuba.scene.usual_regions import HEADLESS, USUAL_REGIONS, usual_place
 
 ASSETS = Path(__file__).parents[1] / "data" / "assets"
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -53,6 +56,22 @@ def test_a_region_holds_most_of_such_a_part(part: str) -> None:
 def test_all_parts_of_the_priors_have_one() -> None:
     vocabulary = read_model_conventions(WIDE_FOLDER).vocabulary
     assert vocabulary is not None and set(USUAL_REGIONS) == set(vocabulary.parts)
+    assert set(vocabulary.bodies) > HEADLESS
+
+
+@pytest.mark.parametrize("name", ["teapot", "car", "bottle", "tree", "mug"])
+def test_what_has_no_head_gets_it_on_its_top(name: str, tmp_path: Path) -> None:
+    """A teapot's spout was its head: the highest end of what is longer than high."""
+    body = FINE_BODIES[name](np.random.default_rng(5))
+    points = np.concatenate(
+        [solid.vertices for solid in FINE_PARTS["candle"](Surface(body), np.random.default_rng(6)).values()]
+    )
+    trimesh.Trimesh(body.solid.vertices, body.solid.faces, process=False).export(tmp_path / "it.ply")
+    made = fd.import_asset(tmp_path / "it.ply", tmp_path / "it", prompt=f"a {name} with a candle", up="y")
+    assert any("puts the region at its top" in line for line in made.remarks)
+    scene = fd.load_scene(made.scene)
+    region, there = scene.regions[0], scene.frame.to_canonical(points)
+    assert (region.sdf(there) > 0).mean() > 0.6 and region.size < 2.2 * np.ptp(there, axis=0).max()
 
 
 def test_sizes_and_places_that_are_said_count() -> None:
@@ -119,7 +138,7 @@ def test_a_scene_says_its_prompt_itself(capsys: pytest.CaptureFixture[str]) -> N
     ],
 )
 def test_the_one_part_of_a_prompt(prompt: str | None, part: str | None) -> None:
-    assert prompted_part(prompt) == part
+    assert prompted_parts(prompt).only == part
 
 
 PAIR = "a duck with a shiny golden crown and a blue cape"

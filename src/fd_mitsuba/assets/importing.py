@@ -116,7 +116,7 @@ def import_file(
     if not at and len(regions) > 1:
         remarks.append("puts each part where such a part usually is; an --at for each, in their order, says otherwise")
     elif not at:
-        usual = usual_place(asked.only)
+        usual = usual_place(asked.only, asked.headless)
         where = "on its head" if usual == "head" else f"at {places.find(usual).about}"
         remarks.append(f"puts the region {where}; --at says otherwise: top, back, 'left side', x,y,z and the like")
     if prompt is None:

@@ -68,13 +68,15 @@ def prompted_regions(
         UserError: a place or a size that is not known.
     """
     if not asked.alone or len(at) not in (0, len(asked.alone)):
-        regions, about = placed_regions(places, at or (usual_place(asked.only),), size, subtract, asked.only)
+        regions, about = placed_regions(
+            places, at or (usual_place(asked.only, asked.headless),), size, subtract, asked.only
+        )
         if asked.alone:
             about[-1] += f"; {', '.join(asked.alone)} grow as one there: an --at for each puts them apart"
         return regions, about
     regions, about = [], []
     for number, (part, alone) in enumerate(asked.alone.items()):
-        place = at[number] if at else usual_place(part)
+        place = at[number] if at else usual_place(part, asked.headless)
         (region,), (said,) = placed_regions(places, [place], size, subtract, part)
         name = part.replace(" ", "_")
         regions.append(replace(region, name=name, part=name, prompt=alone))

@@ -8,19 +8,7 @@ from fd_mitsuba.config.for_model import BUILTIN_WIDE
 from fd_mitsuba.guidance.model_vocabulary import vocabulary_of
 from fd_mitsuba.guidance.prompt_reader import read_prompt
 from fd_mitsuba.guidance.vocabulary import WITHOUT
-from fd_mitsuba.scene.usual_regions import PromptedParts
-
-
-def prompted_part(prompt: str | None, base_prompt: str = "", removed: bool = False) -> str | None:
-    """The part's usual name; None where the prompt asks for none that any shipped prior knows, or for several.
-
-    Args:
-        removed: the part that it wants off.
-
-    >>> prompted_part("a duck wearing sunglasses"), prompted_part("a duck with a crown and a cape")
-    ('glasses', None)
-    """
-    return prompted_parts(prompt, base_prompt, removed).only
+from fd_mitsuba.scene.usual_regions import HEADLESS, PromptedParts
 
 
 def prompted_parts(prompt: str | None, base_prompt: str = "", removed: bool = False) -> PromptedParts:
@@ -30,6 +18,8 @@ def prompted_parts(prompt: str | None, base_prompt: str = "", removed: bool = Fa
         base_prompt: what it says of the object now; the parts in it are there already.
         removed: the parts that it wants off.
 
+    >>> prompted_parts("a duck wearing sunglasses").only
+    'glasses'
     >>> prompted_parts("a duck with a golden crown and a cape").alone
     {'crown': 'a duck with a golden crown', 'cape': 'a duck with a cape'}
     """
@@ -44,15 +34,17 @@ def prompted_parts(prompt: str | None, base_prompt: str = "", removed: bool = Fa
 
     reading = read_prompt(prompt or "", vocabulary, base_prompt)
     noun = f"a {vocabulary.bodies[reading.bodies[0]][0]}" if reading.bodies else None
+    headless = bool(reading.bodies) and reading.bodies[0] in HEADLESS
     body = bare(_first_words(prompt)) or noun
     there = read_prompt(base_prompt, vocabulary).parts if base_prompt and not removed else ()
     named = reading.removed if removed else reading.parts
     parts = [name for name in named if name in vocabulary.parts and name not in there]
     if len(parts) < 2:
-        return PromptedParts(next(iter(parts), None), body=body)
+        return PromptedParts(next(iter(parts), None), body=body, headless=headless)
     whole, link = bare(base_prompt) or body or "an object", WITHOUT if removed else "with"
     phrases = {name: vocabulary.parts[name][0] if removed else reading.phrases[name] for name in parts}
-    return PromptedParts(alone={name: f"{whole} {link} {words}" for name, words in phrases.items()}, body=body)
+    alone = {name: f"{whole} {link} {words}" for name, words in phrases.items()}
+    return PromptedParts(alone=alone, body=body, headless=headless)
 
 
 def _first_words(prompt: str | None) -> str | None:

@@ -160,8 +160,8 @@ class Query:
     def passes(self, z_t: Tensor, timesteps: Tensor, names: Collection[str]) -> dict[str, Tensor]:
         """Noise of each named pass: e + sum over areas of mask (e(area's text) - e).
 
-        A network that is told where the part may be is told of that area alone with its text. Where an area is all there
-        is, nothing else is asked.
+        A network that is told where the part may be is told of that area alone with its text. Where an area is all
+        there is, nothing else is asked.
         """
         texts = {name: text for name, text in self.chunk.texts.items() if name in names}
         if missing := set(names) - set(texts):

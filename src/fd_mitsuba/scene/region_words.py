@@ -20,6 +20,8 @@ _REACH, _REACH_OF_FACE = 0.3, 1.0
 face goes round it."""
 _HEAD_WIDTHS = 0.17, 0.44
 """Least and largest width of a head, as shares of the longest side: what is put on a mug is no wider."""
+_TOP_WIDTHS = 0.29, 0.44
+"""The same of what is on top of an object without a head, such as the lid of a teapot, whose knob is no measure."""
 _HOLLOW = 0.5
 """Of the height: what is so far below the top, seen from above, is the floor of a vessel."""
 _FEET_APART = 0.4
@@ -104,10 +106,16 @@ class ObjectPlaces:
     @cached_property
     def head_width(self) -> float:
         """At the height of its eyes; within what a head can have of the longest side."""
-        around = self._eye_level()
+        return self._width(self._eye_level(), _HEAD_WIDTHS)
+
+    @cached_property
+    def top_width(self) -> float:
+        """As the head's, of what is below its highest point."""
+        return self._width(eye_level(self._points, self.find("top").point[1], self._height), _TOP_WIDTHS)
+
+    def _width(self, around: np.ndarray, shares: tuple[float, float]) -> float:
         width = float(np.ptp(np.quantile(around[:, 0], (0.02, 0.98))))
-        least, most = (share * self.longest_side for share in _HEAD_WIDTHS)
-        return min(max(width, least), most)
+        return float(np.clip(width, *(share * self.longest_side for share in shares)))
 
     @property
     def _height(self) -> float:

@@ -82,6 +82,10 @@ USUAL_REGIONS: Mapping[str, UsualRegion] = {
 """By the names of parts that the built-in priors' vocabulary has."""
 
 
+HEADLESS = frozenset(("vase", "mug", "pumpkin", "ball", "chair", "car", "teapot", "bottle", "shoe", "house", "tree"))
+"""Bodies of that vocabulary whose highest end is no head: that of a teapot may be its spout."""
+
+
 @dataclass(frozen=True)
 class PromptedParts:
     """What a prompt asks for, as far as regions are concerned; see `guidance.prompted_part`.
@@ -90,11 +94,13 @@ class PromptedParts:
         only: name of the one part; None: none that is known, or several.
         alone: of several parts, by name and in the prompt's order, a prompt for each; else empty.
         body: what the prompt calls the object itself; None: it does not say.
+        headless: whether that is one of `HEADLESS`.
     """
 
     only: str | None = None
     alone: Mapping[str, str] = field(default_factory=dict)
     body: str | None = None
+    headless: bool = False
 
 
 def usual_region(part: str | None, place: Place) -> UsualRegion | None:
@@ -106,15 +112,22 @@ def usual_region(part: str | None, place: Place) -> UsualRegion | None:
     return usual if place.name in (own, own.replace("left", "right"), POINT) else None
 
 
-def usual_place(part: str | None) -> str:
-    """Where `--at` puts a part where nothing is said; on the head of what is not known."""
+def usual_place(part: str | None, headless: bool = False) -> str:
+    """Where `--at` puts a part where nothing is said; on the head of what is not known.
+
+    Args:
+        headless: of an object without a head, what belongs there is on its top.
+    """
     usual = USUAL_REGIONS.get(part or "")
-    return "head" if usual is None else usual.place
+    place = "head" if usual is None else usual.place
+    return "top" if headless and place == "head" else place
 
 
 def region_for(usual: UsualRegion, places: ObjectPlaces, place: Place, name: str | None = None) -> PlacedRegion:
     """The ellipsoid for a part at a place, a little larger than the part usually is."""
-    unit = places.head_width if usual.by_head else places.longest_side
+    unit = places.longest_side
+    if usual.by_head:
+        unit = places.top_width if place.name == "top" else places.head_width
     half = _ROOM * unit * np.asarray(usual.size) / 2
     level = abs(place.normal[1]) < _LEVEL
     shift = np.array([0.0, usual.up if level else 0.0, 0.0 if level else usual.ahead])

@@ -12,7 +12,7 @@ import numpy as np
 
 from fd_mitsuba.assets.placing import placed_regions
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance.prompted_part import prompted_part
+from fd_mitsuba.guidance.prompted_part import prompted_parts
 from fd_mitsuba.io.atomic import write_atomically
 from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import ADD
@@ -98,10 +98,11 @@ class EditState:
         return not self.regions.pose(poses[0].name).lies_on(usual)
 
     def _usual_pose(self, pose: EllipsoidPose, prompt: str) -> EllipsoidPose:
-        part = prompted_part(prompt)
-        (region,), _ = placed_regions(self._places, [usual_place(part)], None, part=part)
-        place = EllipsoidPose.of_matrix(pose.name, region.to_world())
-        return replace(pose, centre=place.centre, wxyz=place.wxyz, radii=place.radii)
+        asked = prompted_parts(prompt)
+        place = usual_place(asked.only, asked.headless)
+        (region,), _ = placed_regions(self._places, [place], None, part=asked.only)
+        usual = EllipsoidPose.of_matrix(pose.name, region.to_world())
+        return replace(pose, centre=usual.centre, wxyz=usual.wxyz, radii=usual.radii)
 
     @cached_property
     def _places(self) -> ObjectPlaces:
