@@ -37,7 +37,7 @@ from fd_mitsuba.prior.data.fine.bodies import BODIES  # noqa: E402
 from fd_mitsuba.runs.geometry_outcome import load_finished_stage  # noqa: E402
 from fd_mitsuba.runs.saved_run import saved_run  # noqa: E402
 from fd_mitsuba.scene.load_scene import load_edit_scene  # noqa: E402
-from fd_mitsuba.scene.usual_regions import usual_place  # noqa: E402
+from fd_mitsuba.scene.usual_regions import HEADLESS, usual_place  # noqa: E402
 from fd_mitsuba.viewing.turntable import render_ring, write_sheet  # noqa: E402
 
 VIEWS, SHEET_SIZE = 8, 112
@@ -85,7 +85,7 @@ def grow(case: Case, folder: Path, config: Path, settings: list[str], cores: str
     command = [sys.executable, "-m", "fd_mitsuba", "run", str(write_scene(case, folder)), "--prompt", case.prompt]
     command += ["-c", str(config), "-o", str(run), "--stage", "geometry", "-q"]
     if case.by_words:
-        command += ["--at", usual_place(case.part)]
+        command += ["--at", usual_place(case.part, case.body in HEADLESS)]
         command += [] if case.scene else ["--up", "y", "--front", "z"]
     command += [argument for setting in settings for argument in ("--set", setting)]
     command += ["--resume"] if (run / "run.json").is_file() else []
