@@ -25,6 +25,9 @@ QUICK = RunConfig.load("quick")
         ("put a tiara on the dragon", None),  # both know crowns, and dogs stand in for dragons
         ("a cat with a halo", "guidance.model: builtin-wide, which knows halo"),
         ("a bear with a muffler and a crown", "guidance.model: builtin-wide, which knows scarf"),
+        ("a man with sunglasses", None),
+        ("a rabbit in a top hat", "guidance.model: builtin-wide, which draws top hat better"),
+        ("a rabbit with a top hat and a sword", "guidance.model: builtin-wide, which knows sword"),
         ("a cat with a laptop", None),  # neither knows it
         ("a mug without a handle", None),  # nothing is added; a run says so
     ],
