@@ -115,7 +115,8 @@ class ObjectPlaces:
 
     def _width(self, around: np.ndarray, shares: tuple[float, float]) -> float:
         width = float(np.ptp(np.quantile(around[:, 0], (0.02, 0.98))))
-        return float(np.clip(width, *(share * self.longest_side for share in shares)))
+        least, most = (share * self.longest_side for share in shares)
+        return min(max(width, least), most)
 
     @property
     def _height(self) -> float:

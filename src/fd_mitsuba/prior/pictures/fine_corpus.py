@@ -38,6 +38,7 @@ REMOVED_SHARE = 0.1
 BESIDE_SHARE = 0.12
 """Pairs whose body wears another part, before and after."""
 Hits = tuple[np.ndarray, np.ndarray]
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 Grow = Callable[[str, Surface, np.random.Generator], Solid | None]
 
 
@@ -118,9 +119,9 @@ def make_fine_pairs(
     before: tuple[str, RayCaster] | None = None
 
     def add(
-        camera: MosaicCamera, rays: tuple, base: Hits, solid: Solid | None, own: RayCaster | None, closeup: bool
+        camera: MosaicCamera, rays: Rays, base: Hits, grown: tuple[str, Solid, RayCaster] | None, closeup: bool
     ) -> None:
-        part = None if own is None else name
+        part, solid, own = (None, None, None) if grown is None else grown
         beside = None
         if before is not None and before[0] != part and rng.random() < BESIDE_SHARE:
             beside, base = before[0], nearer(base, before[1].cast(*rays[:2]))
@@ -130,19 +131,19 @@ def make_fine_pairs(
         first, second = (shade(*hits, rays[2], view_size) for hits in (base, edited))
         if removed:
             first, second = second, first
-        region = told_region(solid, surface.body.solid, *rays[:2], region_rng, view_size)
+        region = told_region(solid, surface.body.solid, rays[0], rays[1], region_rng, view_size)
         view = camera.azimuth_deg, closeup
         pairs.append(FinePair(first, second, words, body, part, *view, removed=removed, beside=beside, region=region))
 
     for name in parts:
         solid = None if name is None else grow(name, surface, rng)
         if name is None or solid is None:
-            add(overview, overview_rays, overview_hits, None, None, False)
+            add(overview, overview_rays, overview_hits, None, False)
             continue
-        own = RayCaster(solid)
-        add(overview, overview_rays, overview_hits, solid, own, False)
+        grown = name, solid, RayCaster(solid)
+        add(overview, overview_rays, overview_hits, grown, False)
         near = closeup_camera(solid, rng)
         rays = near.rays(view_size)
-        add(near, rays, surface.caster.cast(*rays[:2]), solid, own, True)
-        before = name, own
+        add(near, rays, surface.caster.cast(*rays[:2]), grown, True)
+        before = name, grown[2]
     return pairs
