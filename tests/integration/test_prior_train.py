@@ -32,6 +32,14 @@ def test_training_resumes_and_starts_from_packed_weights(tmp_path: Path) -> None
     assert state["step"] == 2
     pack(first / "checkpoint.pt", tmp_path / "packed")
     assert builtin_folder(tmp_path / "packed")
+    for weights in (state["modules"], state["average"]):
+        weights["unet.conv_in.weight"] = weights["unet.conv_in.weight"][:, 1:]
+    torch.save(state, tmp_path / "checkpoint.pt")
+    for use in (lambda: train(tmp_path, seconds=600), lambda: pack(tmp_path / "checkpoint.pt", tmp_path / "not")):
+        with pytest.raises(UserError, match=r"checkpoint.pt: unet.conv_in.weight is of shape \(16, 8, 3, 3\), not"):
+            use()
+    assert not (tmp_path / "not").exists()
+    state = torch.load(first / "checkpoint.pt", weights_only=True)
 
     train(second, seconds=0, batch_size=2, total_steps=1, init=tmp_path / "packed")
     started = torch.load(second / "checkpoint.pt", weights_only=True)

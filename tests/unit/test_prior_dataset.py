@@ -61,6 +61,15 @@ def test_stored_pairs_are_those_that_were_drawn_and_can_be_trained_on(small_shar
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1
 
 
+def test_pairs_of_an_earlier_version_are_refused(small_shards: None, tmp_path: Path) -> None:
+    build_data(tmp_path, 4, 5)
+    shard = next(tmp_path.glob("*.npz"))
+    arrays = dict(np.load(shard))
+    np.savez(shard, **{**arrays, "base": arrays["base"][:, 1:]})
+    with pytest.raises(UserError, match="an earlier version's, which told no region; make them anew"):
+        StoredPairs(tmp_path, GEOMETRY, 0)
+
+
 def test_wrong_data_are_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no training data there"):
         StoredPairs(tmp_path, GEOMETRY, 0)

@@ -96,6 +96,8 @@ class StoredPairs:
         self.base, self.edited, packed = (
             np.concatenate([shard[name] for shard in loaded]) for name in ("base", "edited", "changed")
         )
+        if self.base.shape[1] != kind.input_channels - 4:
+            raise UserError(f"{folder}: its pairs are an earlier version's, which told no region; make them anew")
         self.changed = np.unpackbits(packed, axis=-1)
         lines = [line for path in shards for line in path.with_suffix(".jsonl").read_text("utf-8").splitlines()]
         self.captions = [json.loads(line)["caption"] for line in lines]

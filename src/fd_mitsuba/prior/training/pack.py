@@ -13,6 +13,7 @@ from fd_mitsuba.guidance.builtin import SUMS_NAME, write_hashes
 from fd_mitsuba.prior.training import clip_train
 from fd_mitsuba.prior.training.kinds import GEOMETRY, kind_named
 from fd_mitsuba.prior.training.model import build_scheduler, build_tokenizer
+from fd_mitsuba.prior.training.training_folder import require_same_shapes
 
 
 def pack(checkpoint: Path, folder: Path) -> None:
@@ -23,6 +24,9 @@ def pack(checkpoint: Path, folder: Path) -> None:
     Args:
         checkpoint: `checkpoint.pt` of `training.train.train` or `clip_train.train_evaluator`; it says which kind it is.
         folder: created; existing files are replaced.
+
+    Raises:
+        UserError: weights of another version's networks.
     """
     state = torch.load(checkpoint, weights_only=True)
     if state.get("kind") == clip_train.KIND:
@@ -33,6 +37,7 @@ def pack(checkpoint: Path, folder: Path) -> None:
     modules: Any = kind.build_modules(tokenizer)
     if "step" in state and state["step"] <= state.get("small_steps", 0):  # all that it has seen
         modules["unet"].register_to_config(sample_size=kind.view_size)
+    require_same_shapes(checkpoint, state["average"], modules)
     missing = modules.load_state_dict(state["average"], strict=False).missing_keys
     if any("position_ids" not in key for key in missing):
         raise ValueError(f"{checkpoint}: lacks {missing}")

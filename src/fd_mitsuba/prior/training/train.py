@@ -16,7 +16,7 @@ from fd_mitsuba.prior.training.model import TokenRows, build_scheduler, build_to
 from fd_mitsuba.prior.training.pool import Pairs, Pool, WorkerPool
 from fd_mitsuba.prior.training.recorded_step import RecordedStep
 from fd_mitsuba.prior.training.step import TrainingStep, memory_format
-from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow
+from fd_mitsuba.prior.training.training_folder import TrainingFolder, follow, require_same_shapes
 from fd_mitsuba.prior.training.warm_start import load_start
 from fd_mitsuba.training.stop_request import stop_on_signals
 
@@ -86,6 +86,7 @@ def train(
             raise UserError(
                 f"{files.checkpoint}: trained with another vocabulary; pack it as it was and start with --init"
             )
+        require_same_shapes(files.checkpoint, state["modules"], modules)
         modules.load_state_dict(state["modules"])
         optimiser.load_state_dict(state["optimiser"])
         for group in optimiser.param_groups:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from fd_mitsuba.errors import UserError
 
 _SAVE_EVERY_SECONDS = 300
 
@@ -43,6 +46,18 @@ class TrainingFolder:
         """Add a line to the log."""
         with open(self._log, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
+
+
+def require_same_shapes(checkpoint: Path, weights: Mapping[str, torch.Tensor], modules: torch.nn.Module) -> None:
+    """UserError where a checkpoint's weights are of networks of other shapes: an earlier version's of the same kind."""
+    own = modules.state_dict()
+    other = [name for name, value in weights.items() if name in own and own[name].shape != value.shape]
+    if other:
+        raise UserError(
+            f"{checkpoint}: {other[0]} is of shape {tuple(weights[other[0]].shape)}, not "
+            f"{tuple(own[other[0]].shape)}: an earlier version's networks; pack it with that version, and start from "
+            "the packed folder with --init"
+        )
 
 
 def follow(average: dict[str, torch.Tensor], module: torch.nn.Module, decay: float) -> None:
