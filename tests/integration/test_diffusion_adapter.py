@@ -560,7 +560,10 @@ def test_bad_folder_is_one_line(folders: dict[str, Path], tmp_path: Path, case: 
     assert "\n" not in message and len(message) < 500
 
 
-HEADERS = ("no index", "wrong class", "no weights", "pickle only", "weights cut short", "depth", "grid", "base")
+HEADERS = (
+    *("no index", "wrong class", "no weights", "pickle only", "weights cut short", "depth", "grid", "base"),
+    *("prediction type", "difference"),
+)
 
 
 @pytest.mark.parametrize("case", HEADERS)

@@ -13,7 +13,6 @@ from fd_mitsuba.guidance import sds
 from fd_mitsuba.guidance.chunk import NOTHING, Beside, Chunk
 from fd_mitsuba.guidance.layout import latent_side
 from fd_mitsuba.guidance.loading import Components
-from fd_mitsuba.guidance.model_conventions import FILE_NAME
 from fd_mitsuba.guidance.multiview import is_multiview
 from fd_mitsuba.guidance.query import Distillation, Query, passes_of
 from fd_mitsuba.guidance.side_by_side import cores_for_samples, of_samples
@@ -47,16 +46,6 @@ class Denoiser:
         self.latent_size = latent_side(components.unet.config)
         self.alpha_bars = sds.levels(components.scheduler.alphas_cumprod).to(self.device)
         self.prediction_type = components.scheduler.config.get("prediction_type", "epsilon")
-        if self.prediction_type not in ("epsilon", "v_prediction", "sample"):
-            raise UserError(
-                f"{components.folder / 'scheduler'}: prediction_type {self.prediction_type!r} is not known; take a "
-                "model with epsilon or v_prediction"
-            )
-        if self.adds_to_base and not (self.has_image_pass and self.prediction_type == "sample"):
-            raise UserError(
-                f"{components.folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels, or 9 with "
-                "sees_region, and prediction_type sample; remove the entry"
-            )
 
     def predict_noise(
         self, z_t: Tensor, timesteps: Tensor, texts: dict[str, Tensor], beside: Beside = NOTHING

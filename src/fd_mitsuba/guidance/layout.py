@@ -161,12 +161,25 @@ def _check_vae(path: Path, vae: dict[str, Any]) -> None:
             raise UserError(f"{path}: {key} is {value!r}, not {wanted}; fetch the file again")
 
 
-def check_scheduler(folder: Path) -> None:
-    """UserError where a pipeline's schedule has not two timesteps, between which noise is drawn."""
+def check_scheduler(folder: Path, unet: dict[str, Any], conventions: ModelConventions) -> None:
+    """UserError where a pipeline's schedule has not two timesteps, between which noise is drawn, or where what its UNet
+    says of a noisy picture is not known.
+    """
     path = folder / "scheduler" / "scheduler_config.json"
-    count = read_json(path).get("num_train_timesteps", 1000)
+    schedule = read_json(path)
+    count, predicted = schedule.get("num_train_timesteps", 1000), schedule.get("prediction_type", "epsilon")
     if not _is_whole(count, 2):
         raise UserError(f"{path}: num_train_timesteps is {count!r}, not a whole number above 1; fetch the file again")
+    if predicted not in ("epsilon", "v_prediction", "sample"):
+        raise UserError(
+            f"{path}: prediction_type {predicted!r} is not known; take a model with epsilon or v_prediction"
+        )
+    sees_base = unet.get("in_channels", 4) == 8 or conventions.sees_region
+    if conventions.predicts == "difference" and not (sees_base and predicted == "sample"):
+        raise UserError(
+            f"{folder / FILE_NAME}: predicts difference takes a UNet with 8 input channels, or 9 with sees_region, and "
+            "prediction_type sample; remove the entry"
+        )
 
 
 def check_sizes(folder: Path, configs: dict[str, dict[str, Any]], conventions: ModelConventions) -> None:

@@ -68,7 +68,7 @@ def read_headers(folder: Path, config: GuidanceConfig) -> ModelHeaders:
     configs["unet"] = unet_config(folder / "unet" / "config.json", configs["unet"])
     conventions = multiview_conventions(folder, configs["unet"], read_model_conventions(folder), config)
     check_sizes(folder, configs, conventions)
-    check_scheduler(folder)
+    check_scheduler(folder, configs["unet"], conventions)
     found = {part: weight_files(folder, part) for part in WEIGHTS}
     files = {part: paths for part, (paths, _) in found.items()}
     counts = {part: sum(map(count_weights, paths)) for part, paths in files.items()}
