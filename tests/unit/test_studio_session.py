@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fd_mitsuba.api import import_asset
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.scene.load_scene import load_edit_scene
 from fd_mitsuba.studio import checks as checking
@@ -19,6 +20,7 @@ from fd_mitsuba.studio.job import RunOrder
 from fd_mitsuba.studio.live_check import LiveCheck
 from fd_mitsuba.studio.opening import open_target
 from fd_mitsuba.studio.plain_text import without_paths
+from fd_mitsuba.studio.region_list import RegionList
 from fd_mitsuba.studio.run_state import QUEUED
 from fd_mitsuba.studio.session import Session
 from fd_mitsuba.studio.settings import StudioSettings
@@ -84,7 +86,7 @@ def test_an_untouched_region_of_an_opened_mesh_follows_the_prompt(session: Sessi
     session.subscribe(topics.append)
     session.edits.set_prompt("a duck on a skateboard")
     (below,) = session.state.regions.poses.values()
-    assert topics == ["pose", "prompt"] and below.centre[1] < on_head.centre[1]
+    assert topics == ["regions", "prompt"] and below.centre[1] < on_head.centre[1]
     assert max(below.radii) > 2 * min(below.radii)
     session.edits.set_prompt("a duck with a spaceship")
     (back,) = session.state.regions.poses.values()
@@ -96,6 +98,30 @@ def test_an_untouched_region_of_an_opened_mesh_follows_the_prompt(session: Sessi
     (mine,) = session.state.regions.poses.values()
     session.edits.set_prompt("a duck with a crown")  # a region that was touched stays
     assert list(session.state.regions.poses.values()) == [mine]
+
+
+def test_each_part_of_a_prompt_gets_a_region_as_an_import_puts_it(session: Session, tmp_path: Path) -> None:
+    session.open_mesh(ASSETS / "duck.stl")
+    (on_head,) = session.state.regions.poses.values()
+    prompt = "a duck with a golden crown and a red cape"
+    session.edits.set_prompt(prompt)
+    imported = load_edit_scene(import_asset(ASSETS / "duck.stl", tmp_path / "duck", prompt=prompt).scene)
+    found = session.state.regions
+    assert list(found.poses) == ["crown", "cape"] and session.state.selected == "crown"
+    for pose, other in zip(found.poses.values(), RegionList.of_scene(imported).poses.values(), strict=True):
+        assert pose.lies_on(other) and (pose.part, pose.prompt) == (other.part, other.prompt)
+    assert session.state.edited_scene().told_apart
+    session.edits.set_prompt("a duck with a silver crown and a red cape")
+    assert found.poses["crown"].prompt == "a duck with a silver crown"
+    session.edits.set_prompt("a duck with a spaceship")
+    (back,) = session.state.regions.poses.values()
+    assert back.lies_on(on_head) and (back.name, back.part, back.prompt) == ("head", "part", "")
+    assert session.state.selected == "head"
+    session.edits.set_prompt(prompt)
+    session.edits.put(replace(found.poses["cape"], prompt="a duck with a long cape"))
+    mine = list(session.state.regions.poses.values())
+    session.edits.set_prompt("a duck with a crown")  # a prompt that was touched stays, and so do all regions
+    assert list(session.state.regions.poses.values()) == mine
 
 
 def test_a_click_puts_a_region_on_the_base(session: Session) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fd_mitsuba.assets.placing import placed_regions
+from fd_mitsuba.assets.placing import prompted_regions
 from fd_mitsuba.errors import UserError
 from fd_mitsuba.guidance.prompted_part import prompted_parts
 from fd_mitsuba.io.atomic import write_atomically
@@ -18,9 +18,9 @@ from fd_mitsuba.scene.edit_scene import EditScene
 from fd_mitsuba.scene.focal_region import ADD
 from fd_mitsuba.scene.headroom import frame_with_headroom
 from fd_mitsuba.scene.load_scene import load_edit_scene
+from fd_mitsuba.scene.part_stack import free_name
 from fd_mitsuba.scene.region_words import ObjectPlaces
 from fd_mitsuba.scene.triangle_mesh import TriangleMesh
-from fd_mitsuba.scene.usual_regions import usual_place
 from fd_mitsuba.studio.base_glb import base_glb
 from fd_mitsuba.studio.ellipsoid_pose import EllipsoidPose
 from fd_mitsuba.studio.opening import Opened
@@ -85,24 +85,33 @@ class EditState:
         return replace(self.scene, regions=seen, frame=frame, prompt=self.prompt)
 
     def follow_prompt(self, before: str) -> bool:
-        """Put the region where the prompt's part usually is, if it is where that of the prompt `before` usually is: as
-        an import puts it, and untouched. Whether it has moved.
+        """Put regions where the prompt's parts usually are, if they are where those of the prompt `before` usually are:
+        as an import puts them, and untouched. Whether there are others now.
         """
         poses = list(self.regions.poses.values())
-        if len(poses) != 1 or self.regions.meshes or poses[0].mode != ADD:
+        usual = self._usual_poses(before)
+        if self.regions.meshes or not _same_regions(poses, usual):
             return False
-        usual = self._usual_pose(poses[0], before)
-        if not poses[0].lies_on(usual):
+        wanted = self._usual_poses(self.prompt)
+        if _same_regions(wanted, usual):
             return False
-        self.regions.put(self._usual_pose(poses[0], self.prompt))
-        return not self.regions.pose(poses[0].name).lies_on(usual)
+        if len(poses) == len(wanted) == 1:
+            wanted = [replace(wanted[0], name=poses[0].name, part=poses[0].part)]
+        self.regions.poses = {pose.name: pose for pose in wanted}
+        if self.selected not in self.regions.poses:
+            self.selected = wanted[0].name
+        return True
 
-    def _usual_pose(self, pose: EllipsoidPose, prompt: str) -> EllipsoidPose:
-        asked = prompted_parts(prompt)
-        place = usual_place(asked.only, asked.headless)
-        (region,), _ = placed_regions(self._places, [place], None, part=asked.only)
-        usual = EllipsoidPose.of_matrix(pose.name, region.to_world())
-        return replace(pose, centre=usual.centre, wxyz=usual.wxyz, radii=usual.radii)
+    def _usual_poses(self, prompt: str) -> list[EllipsoidPose]:
+        """The regions that an import with that prompt has."""
+        asked = prompted_parts(prompt, self.scene.base_prompt)
+        placed, _ = prompted_regions(self._places, asked, (), None, False)
+        found = []
+        for region in placed:
+            pose = EllipsoidPose.of_matrix(region.name, region.to_world())
+            part = free_name(region.part, self.regions.taken) if region.part else pose.part
+            found.append(replace(pose, part=part, prompt=region.prompt or ""))
+        return found
 
     @cached_property
     def _places(self) -> ObjectPlaces:
@@ -190,3 +199,11 @@ class EditState:
                 self.selected = record["selected"]
         except (KeyError, TypeError, ValueError):
             say(f"{self.source.work.record}: is damaged in part; regions and prompt are taken from the scene")
+
+
+def _same_regions(poses: Sequence[EllipsoidPose], others: Sequence[EllipsoidPose]) -> bool:
+    """Whether as many add the same prompts in the same places."""
+    return len(poses) == len(others) and all(
+        pose.mode == ADD and pose.prompt == other.prompt and pose.lies_on(other)
+        for pose, other in zip(poses, others, strict=True)
+    )

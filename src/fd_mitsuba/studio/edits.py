@@ -116,7 +116,7 @@ class Edits:
     def set_prompt(self, prompt: str) -> None:
         """The sentence for the next run; blank: none can be started. UserError where it is far too long.
 
-        A region that is as an import has put it, and nobody has touched, follows: see `EditState.follow_prompt`.
+        Regions that are as an import has put them, and nobody has touched, follow: see `EditState.follow_prompt`.
         """
         words = one_line_of(prompt)
         if fault := length_fault(words):
@@ -128,7 +128,7 @@ class Edits:
             before, self._state.prompt = self._state.prompt, words
             moved = self._state.follow_prompt(before)
         if moved:
-            self._tell("pose")
+            self._tell("regions")
         self._tell("prompt", check=True)
 
     def set_settings(self, **changed: Any) -> None:
