@@ -98,23 +98,29 @@ def test_a_mesh_needs_nothing_but_a_prompt(tmp_path: Path) -> None:
     assert scene.regions[0].name == "bottom"
     off = fd.import_asset(ASSETS / "duck.stl", tmp_path / "off", prompt="a duck without a tail", subtract=True)
     assert off.regions[0].startswith("rear: ") and off.regions[0].endswith("subtracts")
-    assert not any("refuses" in note for note in off.notes)
+    assert off.refusal is None
     plain = fd.import_asset(ASSETS / "duck.stl", tmp_path / "plain", prompt="a duck with a spaceship")
     assert plain.regions[0].startswith("head: ") and "usual" not in plain.regions[0]
 
 
-def test_an_open_mesh_of_which_something_is_to_go_is_told_at_once(tmp_path: Path) -> None:
-    """Not only by the run after it, in the same words."""
+def test_an_open_mesh_of_which_something_is_to_go_is_told_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not only by the run after it, in the same words, and then no run comes next."""
     mesh = trimesh.creation.box()
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     mesh.export(tmp_path / "box.obj")
-    made = fd.import_asset(tmp_path / "box.obj", tmp_path / "scene", prompt="a box without a horn", subtract=True)
-    (note,) = (note for note in made.notes if "a run refuses the scene as it is: " in note)
+    words = "a box without a horn"
+    made = fd.import_asset(tmp_path / "box.obj", tmp_path / "scene", prompt=words, subtract=True)
     with pytest.raises(fd.UserError) as refused:
         fd.load_scene(made.scene)
-    assert note.endswith(str(refused.value)) and "is not closed (3 boundary edges)" in note
+    assert made.refusal == str(refused.value) and "is not closed (3 boundary edges)" in made.refusal
+    again = tmp_path / "again"
+    assert main(["import", str(tmp_path / "box.obj"), "--prompt", words, "--subtract", "-o", str(again)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith(f"refused  a run refuses the scene as it is: {again}/scene.xml") and "not closed" in last
     grown = fd.import_asset(tmp_path / "box.obj", tmp_path / "grown", prompt="a box with a horn")
-    assert not any("refuses" in note for note in grown.notes)
+    assert grown.refusal is None
 
 
 def test_a_scene_says_its_prompt_itself(capsys: pytest.CaptureFixture[str]) -> None:

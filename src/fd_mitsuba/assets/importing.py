@@ -38,6 +38,7 @@ class ImportedAsset:
         regions: a sentence for each focal region.
         remarks: what was guessed, with the option that says otherwise.
         notes: what was left out or understood in another way.
+        refusal: why a run refuses the scene as it is; None: it was not asked, or it does not.
     """
 
     scene: Path
@@ -48,6 +49,7 @@ class ImportedAsset:
     regions: tuple[str, ...]
     remarks: tuple[str, ...]
     notes: tuple[str, ...]
+    refusal: str | None = None
 
     def lines(self) -> list[str]:
         """All of it for people."""
@@ -56,7 +58,8 @@ class ImportedAsset:
         lines = [f"{self.scene}: {count}, {self.faces} faces, {size} (width x height x depth)"]
         lines += [f"region   {line}" for line in self.regions]
         lines += [f"guess    {line}" for line in self.remarks]
-        return lines + [f"note     {line}" for line in self.notes]
+        lines += [f"note     {line}" for line in self.notes]
+        return lines + ([f"refused  a run refuses the scene as it is: {self.refusal}"] if self.refusal else [])
 
 
 def import_file(
@@ -108,8 +111,6 @@ def import_file(
         unit=units or asset.unit,
     )
     scene = write_scene(folder, shapes, to_scene, regions, text, notes)
-    if subtract:
-        notes += _refused(scene)
     if len(shapes) > _MANY_SHAPES:
         notes.append(f"its {len(shapes)} shapes make renders slow; join those of one look before the export")
     remarks = list(orientation.remarks)
@@ -130,6 +131,7 @@ def import_file(
         tuple(about),
         tuple(remarks),
         tuple(dict.fromkeys(notes)),
+        _refusal(scene) if subtract else None,
     )
 
 
@@ -155,13 +157,13 @@ def _whole(path: Path, shapes: list[SceneShape]) -> tuple[np.ndarray, np.ndarray
     return vertices, faces
 
 
-def _refused(scene: Path) -> list[str]:
+def _refusal(scene: Path) -> str | None:
     """Why nothing can be cut out of what was written, if so: the mesh is not closed, or all of it would go."""
     try:
         load_edit_scene(scene)
     except UserError as error:
-        return [f"a run refuses the scene as it is: {error}"]
-    return []
+        return str(error)
+    return None
 
 
 def _words(path: Path) -> str:

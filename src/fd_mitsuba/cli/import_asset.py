@@ -47,6 +47,8 @@ def _import(options: argparse.Namespace) -> int:
     )
     for line in imported.lines():
         say(line)
+    if imported.refusal is not None:
+        return 0
     wanted = "" if options.prompt else ' --prompt "..."'
     say(f"next     fd_mitsuba run {shlex.quote(str(imported.scene))}{wanted} -o runs/{shlex.quote(path.stem)}")
     return 0
