@@ -36,7 +36,7 @@ def test_training_resumes_and_starts_from_packed_weights(tmp_path: Path) -> None
         weights["unet.conv_in.weight"] = weights["unet.conv_in.weight"][:, 1:]
     torch.save(state, tmp_path / "checkpoint.pt")
     for use in (lambda: train(tmp_path, seconds=600), lambda: pack(tmp_path / "checkpoint.pt", tmp_path / "not")):
-        with pytest.raises(UserError, match=r"checkpoint.pt: unet.conv_in.weight is of shape \(16, 8, 3, 3\), not"):
+        with pytest.raises(UserError, match=r"checkpoint.pt: unet.conv_in.weight is of shape \(32, 8, 3, 3\), not"):
             use()
     assert not (tmp_path / "not").exists()
     state = torch.load(first / "checkpoint.pt", weights_only=True)

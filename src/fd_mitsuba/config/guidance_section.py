@@ -53,7 +53,7 @@ class GuidanceConfig(Section):
     guidance_scale: GuidanceScale = 100.0
     """Written as diffusers does: uncond + w (text - uncond)."""
     image_guidance_scale: GuidanceScale = 1.0
-    """Weight of the base's image, for models with 8 input channels."""
+    """Weight of the base's image, for models that see it whole (8 input channels, or 9 with `sees_region`)."""
     perp_neg: Weight = 0.0
     """Perp-Neg: weight of what the negative prompt asks for beside the prompt; 0: it stands for the empty text."""
     mask_margin: Annotated[int, Field(ge=0, le=64)] = 2

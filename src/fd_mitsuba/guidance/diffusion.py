@@ -219,7 +219,7 @@ class DiffusionGuidance(Denoiser):
         return self.latents(images, phase)
 
     def seen_base(self, base: Tensor, phase: Phase) -> Tensor:
-        """The base's latents as a network with 8 input channels sees them; see `Conditions.seen_base`."""
+        """The base's latents as a network that sees them whole is shown them; see `Conditions.seen_base`."""
         return self.conditions.seen_base(base, phase)
 
     def _distil(

@@ -56,8 +56,8 @@ class PriorEdit(EditedViews):
             )
         if not repaints and not guidance.has_image_pass:
             raise UserError(
-                f"guidance.model = {task.config.guidance.source}: does not see the image that it is to edit (8 input "
-                "channels); name an image editor by the method's setting model"
+                f"guidance.model = {task.config.guidance.source}: does not see the image that it is to edit; name an "
+                "image editor by the method's setting model"
             )
         self._guidance, self._repaints, self._margin = guidance, repaints, margin
         self.side = guidance.latent_size

@@ -13,7 +13,7 @@ from PIL import Image
 from fd_mitsuba.backend.threads import network_threads
 from fd_mitsuba.config import GuidanceConfig
 from fd_mitsuba.errors import UserError
-from fd_mitsuba.guidance import sds
+from fd_mitsuba.guidance import ddim, sds
 from fd_mitsuba.guidance.chunk import Beside
 from fd_mitsuba.guidance.diffusion import DiffusionGuidance
 from fd_mitsuba.prior.pictures.corpus import Pair
@@ -54,25 +54,23 @@ def draw_samples(
     scale: float = 3.0,
     mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Clean latents (N, 4, 64, 64) after `steps` DDIM steps from noise, given the base's latents and full captions.
+    """Clean latents (N, 4, 64, 64) after `steps` of DDIM, as a draft has them, given the base's latents and captions.
 
     Args:
         base: (N, C, 64, 64), the base's latents, after the region where the network is told it.
         mask: (N, 1, 64, 64) of zeros and ones: where noise is; elsewhere the picture is the base's, at every step.
     """
-    generator = torch.Generator().manual_seed(seed)
     seen, base = base, base[:, -4:]
-    z = torch.randn(base.shape, generator=generator)
+    noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed))
     passes = sds.cfg_coefficients_with_image(scale, 1.0)
     texts = guidance.embeddings(captions, passes)
-    times = torch.linspace(len(guidance.alpha_bars) - 1, 0, steps + 1).round().long()
-    for now, following in zip(times[:-1], times[1:], strict=True):
-        repeated = now.repeat(len(base))
-        if mask is not None:
-            z = torch.where(mask > 0, z, guidance.alpha_bars[now].sqrt() * base)
-        noise = sds.combine(guidance.predict_noise(z, repeated, texts, Beside(seen)), passes)
-        z = sds.ddim_step(z, noise, guidance.alpha_bars[repeated], guidance.alpha_bars[following.repeat(len(base))])
-    return z if mask is None else torch.where(mask > 0, z, base)
+    inside = torch.ones_like(base[:, :1]) if mask is None else mask
+
+    def noise_in(z: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
+        z = torch.where(inside > 0, z, guidance.alpha_bars[now].sqrt().view(-1, 1, 1, 1) * base)
+        return sds.combine(guidance.predict_noise(z, now, texts, Beside(seen)), passes)
+
+    return torch.where(inside > 0, ddim.sample(noise_in, guidance.alpha_bars, noise, steps), base)
 
 
 def seen_by(guidance: DiffusionGuidance, pair: Pair) -> np.ndarray:

@@ -118,7 +118,7 @@ GEOMETRY = Kind(
     catalogue=COARSE,
     view_size=32,
     make_pairs=make_pairs,
-    channels=(16, 48, 96, 160),
+    channels=(32, 48, 96, 160),
     norm_groups=1,
     text_width=128,
     text_layers=2,
@@ -131,10 +131,16 @@ GEOMETRY = Kind(
     steps=16000,
     small_steps=1000,
     masked_noise=0.0,
-    rounded=0.0,
+    rounded=0.5,
     prediction="sample",
     build_vae=build_vae,
-    conventions={**_CONVENTIONS, "normal_space": "camera", "predicts": "difference", "sees_region": True},
+    conventions={
+        **_CONVENTIONS,
+        "normal_space": "camera",
+        "predicts": "difference",
+        "sees_region": True,
+        "draft_scale": 2.0,
+    },
 )
 GEOMETRY_FINE = replace(
     GEOMETRY,
@@ -142,8 +148,9 @@ GEOMETRY_FINE = replace(
     catalogue=FINE,
     view_size=64,
     make_pairs=make_fine_pairs,
-    channels=(16, 32, 48, 96, 160),
+    channels=(32, 32, 48, 96, 160),
     fresh_pairs=6,
+    rounded=0.0,
     conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
 )
 GEOMETRY_WIDE = replace(
@@ -151,10 +158,8 @@ GEOMETRY_WIDE = replace(
     name="geometry_wide",
     catalogue=FINE,
     make_pairs=make_wide_pairs,
-    channels=(32, 48, 96, 160),
     fresh_pairs=6,
-    rounded=0.5,
-    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists, "draft_scale": 2.0},
+    conventions={**GEOMETRY.conventions, "vocabulary": FINE.word_lists},
 )
 APPEARANCE = Kind(
     name="appearance",

@@ -24,9 +24,6 @@ ATTENTION_CELLS = (16, 8)
 """Sides of the levels with attention: above 16 x 16 cells it is what costs."""
 
 
-FIRST_LAYER = "conv_in.weight"
-
-
 def build_tokenizer(words: Sequence[str] | None = None) -> PreTrainedTokenizerFast:
     """A CLIP-format byte-pair tokenizer in which every word is a single token, always the same one.
 
@@ -109,20 +106,12 @@ def load_packed(
     if not with_unet:
         return
     unet = load_file(packed / "unet" / "diffusion_pytorch_model.safetensors")
-    unet[FIRST_LAYER] = with_region(unet[FIRST_LAYER], modules["unet"].state_dict()[FIRST_LAYER].shape[1])
     modules["unet"].load_state_dict(unet)
     before = json.loads((packed / "scheduler" / "scheduler_config.json").read_text(encoding="utf-8"))["prediction_type"]
     if {before, prediction_type} == {"v_prediction", "sample"}:
         with torch.no_grad():
             for parameter in modules["unet"].get_submodule("conv_out").parameters():
                 parameter.neg_()
-
-
-def with_region(first: torch.Tensor, channels: int) -> torch.Tensor:
-    """The first layer's weights (out, `channels`, 3, 3): those of 8 channels see nothing yet of the region."""
-    if first.shape[1] == channels:
-        return first
-    return torch.cat([first[:, :4], torch.zeros_like(first[:, :1]), first[:, 4:]], dim=1)
 
 
 def token_numbers(tokenizer: PreTrainedTokenizerFast) -> dict[str, Any]:
@@ -147,7 +136,7 @@ def build_text_encoder(tokenizer: PreTrainedTokenizerFast, width: int = TEXT_WID
 
 
 def build_unet(
-    channels: tuple[int, ...] = (16, 48, 96, 160),
+    channels: tuple[int, ...] = (32, 48, 96, 160),
     text_width: int = TEXT_WIDTH,
     norm_groups: int = 16,
     latent_size: int = LATENT_SIZE,
